@@ -1,0 +1,366 @@
+//! What the library says of itself: collections, shapes, labels, jobs, events.
+
+use crate::mesh::{CleanReport, Format};
+use crate::operators::Operator;
+use serde::{Deserialize, Serialize};
+
+/// What parts share across a collection; never silently changes its meaning.
+pub type LabelId = u32;
+
+/// Which way is up, as a property of a collection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[allow(missing_docs)]
+pub enum Up {
+    PlusX,
+    MinusX,
+    PlusY,
+    MinusY,
+    PlusZ,
+    MinusZ,
+    #[default]
+    Unknown,
+    /// Estimated from the collection.
+    Auto,
+}
+
+/// What a collection is created with.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct CollectionSpec {
+    /// Unique in the library: 1 to 128 characters.
+    pub name: String,
+    /// Number of part kinds; `None`: estimated.
+    pub n_parts: Option<u32>,
+    /// Which way is up.
+    pub up: Up,
+    /// Which Laplacian.
+    pub operator: Operator,
+    /// Faces of the working-resolution proxy; 0: the default.
+    pub working_faces: u32,
+}
+
+/// A collection as it stands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CollectionInfo {
+    /// As created.
+    pub spec: CollectionSpec,
+    /// Sequence number of its newest event; 0 before the first.
+    pub sequence: u64,
+    /// Shapes in it.
+    pub n_shapes: u64,
+    /// Stored shapes whose labels wait to be recomputed.
+    pub n_stale: u64,
+    /// Its labels, retired ones included.
+    pub labels: Vec<LabelInfo>,
+}
+
+/// A label of a collection.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelInfo {
+    /// Its id.
+    pub id: LabelId,
+    /// A name a person gave.
+    pub name: Option<String>,
+    /// sRGB colour.
+    pub colour: [u8; 3],
+    /// The label this one was merged into; `None` while it is in use.
+    pub merged_into: Option<LabelId>,
+}
+
+/// A shape to be added.
+#[derive(Debug, Clone)]
+pub struct NewShape {
+    /// Unique in the collection: 1 to 255 characters, no `/`, no control characters.
+    pub name: String,
+    /// The bytes of the file.
+    pub bytes: Vec<u8>,
+    /// Their format.
+    pub format: Format,
+    /// Whether other bytes under the same name are replaced.
+    pub replace: bool,
+}
+
+/// Names one request of one client, for at least 24 h.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct RequestKey {
+    /// Who asks.
+    pub client_id: String,
+    /// Which request of theirs.
+    pub request_id: String,
+}
+
+/// A shape as it stands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ShapeInfo {
+    /// Its name.
+    pub name: String,
+    /// Position in the order of arrival, from 1; never reused.
+    pub ordinal: u64,
+    /// Version of its labels, from 1.
+    pub version: u64,
+    /// Whether its labels wait to be recomputed.
+    pub stale: bool,
+    /// Polygons of the input.
+    pub n_polygons: u64,
+    /// Area in squared input units.
+    pub area: f64,
+    /// BLAKE3 of the original bytes, hexadecimal.
+    pub content_digest: String,
+    /// What cleaning found and did.
+    pub report: CleanReport,
+    /// Its parts: connected pieces of one label, largest first.
+    pub parts: Vec<PartInfo>,
+    /// The shapes its labels were carried from.
+    pub sources: Vec<Source>,
+    /// Bytes of its array file and of its compressed original.
+    pub stored_bytes: u64,
+}
+
+/// A connected piece of one shape with one label.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PartInfo {
+    /// Its label.
+    pub label: LabelId,
+    /// Share of the shape's area.
+    pub area_share: f64,
+    /// Mean probability of its label, 0 to 1.
+    pub confidence: f64,
+}
+
+/// A shape whose labels were carried over.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Source {
+    /// Its name.
+    pub shape: String,
+    /// Version of its labels that was used.
+    pub version: u64,
+    /// Weight of its vote, summing to 1 over the sources.
+    pub weight: f64,
+}
+
+/// Labels of the polygons of the bytes that were sent, in their order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Labels {
+    /// Which version.
+    pub version: u64,
+    /// `(n_polygons,)`; -1 is unlabelled.
+    pub labels: Vec<i32>,
+    /// Probability of the label, `(n_polygons,)`.
+    pub confidence: Vec<f32>,
+}
+
+/// What became of one shape of a job.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ItemState {
+    /// Not yet begun.
+    Queued,
+    /// Being described or placed; the stage by name.
+    Running(String),
+    /// Labelled and durable.
+    Done(Box<Placed>),
+    /// Refused, with the reason.
+    Failed(Failure),
+    /// Cancelled before it was placed.
+    Cancelled,
+}
+
+/// Why a shape was refused.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Failure {
+    /// The error code, as on the wire: `INVALID_ARGUMENT`, `ALREADY_EXISTS`, ...
+    pub code: String,
+    /// A stable reason within the code: `PARSE`, `NON_FINITE_VERTEX`, `NAME_TAKEN`, ...
+    pub reason: String,
+    /// For people: the value and the limit.
+    pub message: String,
+}
+
+/// One shape of a job.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JobItem {
+    /// Which job.
+    pub job: u64,
+    /// Position in the job, from 0.
+    pub index: u32,
+    /// Which collection.
+    pub collection: String,
+    /// The shape's name.
+    pub name: String,
+    /// What became of it.
+    pub state: ItemState,
+}
+
+/// Shapes that were accepted together.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Job {
+    /// Its id.
+    pub id: u64,
+    /// Which collection.
+    pub collection: String,
+    /// Its shapes in order.
+    pub items: Vec<JobItem>,
+}
+
+/// What became of an added shape.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub enum Outcome {
+    Added,
+    /// Same name, same bytes: nothing was done.
+    Unchanged,
+    Replaced,
+}
+
+/// A shape that was labelled and committed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Placed {
+    /// What was done.
+    pub outcome: Outcome,
+    /// Version of its labels.
+    pub version: u64,
+    /// Sequence number of the collection after the commit.
+    pub sequence: u64,
+    /// Functional maps that were computed.
+    pub n_maps: u32,
+    /// Stored shapes whose labels were recomputed inside this addition.
+    pub n_relabelled: u32,
+    /// Milliseconds by stage, in order: parse, clean, proxy, laplacian, spectrum, descriptors, ...
+    pub stages_ms: Vec<(String, f64)>,
+}
+
+/// Something that happened to a collection.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Event {
+    /// Position in the collection's log, from 1, without gaps.
+    pub sequence: u64,
+    /// What happened.
+    pub kind: EventKind,
+}
+
+/// What can happen to a collection.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum EventKind {
+    /// The collection was created.
+    CollectionCreated,
+    /// A shape is there, labelled.
+    ShapeAdded {
+        /// Its name.
+        shape: String,
+        /// Version of its labels.
+        version: u64,
+        /// Label and share of the shape's area.
+        area_shares: Vec<(LabelId, f64)>,
+    },
+    /// A shape is gone.
+    ShapeRemoved {
+        /// Its name.
+        shape: String,
+    },
+    /// A stored shape has a new version of its labels.
+    LabelsChanged {
+        /// Its name.
+        shape: String,
+        /// The new version.
+        version: u64,
+        /// The rule that allowed it: `reclustering`, `correction`, ...
+        cause: String,
+        /// Share of the shape's area that moved, from label to label (-1: unlabelled).
+        moves: Vec<LabelMove>,
+    },
+    /// A label came into being.
+    LabelCreated {
+        /// Its id.
+        label: LabelId,
+    },
+    /// A label turned out to be part of another one; the old id resolves to it.
+    LabelMerged {
+        /// The retired id.
+        from: LabelId,
+        /// The id that stands for both.
+        into: LabelId,
+    },
+    /// A label turned out to be several; the old id keeps the largest share.
+    LabelSplit {
+        /// The id that was split.
+        from: LabelId,
+        /// The new ids.
+        into: Vec<LabelId>,
+    },
+    /// A label was given a name.
+    LabelNamed {
+        /// Which label.
+        label: LabelId,
+        /// The name.
+        name: String,
+    },
+    /// The parts of the collection were clustered anew.
+    Reclustered {
+        /// Score of the labelling before and after; see docs/architecture.md.
+        score_before: f64,
+        /// Score of the new labelling.
+        score_after: f64,
+        /// Whether the new labelling was taken.
+        accepted: bool,
+    },
+}
+
+/// Area that moved from one label to another.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LabelMove {
+    /// Label before (-1: unlabelled).
+    pub from: i64,
+    /// Label after.
+    pub to: i64,
+    /// Share of the shape's area.
+    pub area_share: f64,
+}
+
+/// A functional map between two shapes of a collection, with its quality.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapInfo {
+    /// `c_12 (k2, k1)`, row-major: coefficients on `from` to coefficients on `to`.
+    pub c_12: Vec<f32>,
+    /// Rows.
+    pub k2: usize,
+    /// Columns.
+    pub k1: usize,
+    /// `p2p_21 (n2,)`: for each proxy vertex of `to` a proxy vertex of `from`.
+    pub p2p_21: Vec<u32>,
+    /// How good it is.
+    pub quality: crate::fmap::Quality,
+}
+
+/// Which part of one shape matches which part of another.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PartMatch {
+    /// Index into the parts of the first shape.
+    pub part_a: u32,
+    /// Index into the parts of the second shape.
+    pub part_b: u32,
+    /// Label of the part of the first shape.
+    pub label_a: LabelId,
+    /// Label of the part of the second shape.
+    pub label_b: LabelId,
+    /// Intersection over union of the parts' areas under the map.
+    pub overlap: f64,
+}
+
+/// Counters for the operator.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LibraryStats {
+    /// Collections.
+    pub n_collections: u64,
+    /// Shapes.
+    pub n_shapes: u64,
+    /// Job items not yet done.
+    pub n_queued: u64,
+    /// Stored shapes whose labels wait to be recomputed.
+    pub n_stale: u64,
+    /// Bytes of array files and originals.
+    pub stored_bytes: u64,
+    /// Bytes of the catalog.
+    pub catalog_bytes: u64,
+    /// Most stored shapes relabelled by one addition since start.
+    pub max_relabelled: u64,
+    /// Most functional maps computed by one addition since start.
+    pub max_maps: u64,
+}

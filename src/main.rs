@@ -1,0 +1,2 @@
+//! The `coseg` command.
+fn main() {}
