@@ -18,6 +18,21 @@ pub enum Format {
     Off,
 }
 
+impl Format {
+    /// The format a file name's extension says, in any case; `None` for any other extension.
+    pub fn from_name(file_name: &str) -> Option<Self> {
+        let (stem, extension) = file_name.rsplit_once('.')?;
+        if stem.is_empty() {
+            return None;
+        }
+        match extension.to_ascii_lowercase().as_str() {
+            "obj" => Some(Self::Obj),
+            "off" => Some(Self::Off),
+            _ => None,
+        }
+    }
+}
+
 /// What a file holds: `polygons` triangulated as fans, in file order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParsedMesh {
