@@ -141,7 +141,7 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
     };
     let (router, publisher, wake, wake_sender) = sockets().map_err(failed)?;
     let mut locks = Vec::new();
-    let mut listen = |socket: &zmq::Socket, endpoint: &Endpoint| {
+    let mut listen = |socket: &zmq::Socket, endpoint: &Endpoint| -> Result<Endpoint, StartError> {
         if let Endpoint::Ipc(path) = endpoint {
             locks.push(claim_socket(path)?);
         }
@@ -159,7 +159,7 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
             }
             Endpoint::Tcp { .. } => {
                 let last = socket.get_last_endpoint().map_err(failed)?;
-                Ok(Endpoint::parse(&String::from_utf8_lossy(&last.unwrap_or_else(|raw| raw)).replace('\0', ""))?)
+                Ok(Endpoint::parse(&last.map_err(|_| failed(zmq::Error::EINVAL))?)?)
             }
         }
     };

@@ -11,6 +11,7 @@ use crate::daemon::publish::Notice;
 use crate::daemon::{Daemon, blocking, panic_text};
 use crate::ipc::convert;
 use crate::library::{Described, Failure, ItemState, Job, JobItem, LibraryError};
+use crate::pipeline::Description;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -177,7 +178,7 @@ async fn hand_out(daemon: &Arc<Daemon>) {
             drop(worker);
             let mut memory = memory;
             if let Ok(d) = &outcome {
-                memory.shrink_to(d.description.n_bytes() as u64);
+                memory.shrink_to(bytes_of(&d.description));
             } else {
                 memory.shrink_to(0);
             }
@@ -216,6 +217,19 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
         Ok(Err(failure)) => Err(failure),
         Err(panic) => Err(panicked(&panic_text(panic.as_ref()))),
     }
+}
+
+/// Bytes that a description holds until it is placed.
+fn bytes_of(d: &Description) -> u64 {
+    let floats = d.mass.len()
+        + d.eigenvectors.len()
+        + d.hks.len()
+        + d.face_descriptors.len()
+        + d.polygon_area.len()
+        + d.signature.len();
+    let integers = d.patches.len() + d.face_map.len();
+    let triples = d.vertices.len() + d.faces.len();
+    (4 * (floats + integers) + 12 * triples + 8 * d.eigenvalues.len()) as u64
 }
 
 fn cancelled() -> Failure {
