@@ -21,6 +21,7 @@ use crate::Library;
 use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::library::LibraryError;
+use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use progress::Waiting;
 use publish::Notice;
@@ -36,6 +37,9 @@ use work::Work;
 const ARRIVAL_QUEUE: usize = 256;
 /// How long the runtime is given to answer what was asked before the sockets close.
 const LAST_ANSWERS: Duration = Duration::from_secs(2);
+
+/// Time between sweeps of orphaned files.
+const SWEEP_EVERY: Duration = Duration::from_secs(3_600);
 
 /// Why the daemon did not start.
 #[derive(Debug, thiserror::Error)]
@@ -144,7 +148,11 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let directory = config.library()?;
     let opened = |source| StartError::Library { path: directory.display().to_string(), source };
     let library = Library::open(&directory).map_err(opened)?;
-    let queued = library.queued_items().map_err(opened)?;
+    let mut queued = Vec::new();
+    for item in library.queued_items().map_err(opened)? {
+        let n_bytes = library.item_bytes(&item).map_err(opened)?;
+        queued.push(Waiting { item, n_bytes });
+    }
     let collections = library.collections().map_err(opened)?;
 
     let (requests_in, requests_out) = mpsc::channel(ARRIVAL_QUEUE);
@@ -189,9 +197,10 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     if !queued.is_empty() {
         tracing::info!(shapes = queued.len(), "taking up what the last run left");
     }
-    daemon.take_up_items(queued.into_iter().map(Waiting::resumed).collect());
+    daemon.take_up_items(queued);
     tokio::spawn(work::schedule(Arc::clone(&daemon)));
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
+    tokio::spawn(sweep(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
     drop(guard);
     let shared = sockets::Shared {
@@ -218,6 +227,20 @@ fn instance() -> String {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     let nanos = since.map_or(0, |d| d.as_nanos());
     format!("{:x}-{nanos:x}-{:x}", std::process::id(), STARTS.fetch_add(1, Ordering::Relaxed))
+}
+
+/// Removes files that nothing needs any more, now and then; never at start.
+async fn sweep(daemon: Arc<Daemon>) {
+    loop {
+        tokio::time::sleep(SWEEP_EVERY).await;
+        let swept = blocking(&daemon, |d| d.library.store().sweep_orphans(ORPHAN_AGE)).await;
+        match swept {
+            Ok(Ok(files)) if files.is_empty() => {}
+            Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
+            Ok(Err(e)) => tracing::warn!(error = %e, "orphaned files cannot be removed"),
+            Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
+        }
+    }
 }
 
 /// Shows the watchdog that the runtime runs tasks.

@@ -14,16 +14,6 @@ pub(crate) struct Waiting {
     pub(crate) n_bytes: u64,
 }
 
-/// Assumed of a shape whose size is not at hand.
-const TYPICAL_BYTES: u64 = 4 << 20;
-
-impl Waiting {
-    /// A shape that an earlier run left.
-    pub(crate) fn resumed(item: JobItem) -> Self {
-        Self { item, n_bytes: TYPICAL_BYTES }
-    }
-}
-
 /// A job of which something is left to do.
 #[derive(Debug, Default)]
 struct LiveJob {

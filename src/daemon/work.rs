@@ -12,6 +12,7 @@ use crate::daemon::{Daemon, blocking, panic_text};
 use crate::ipc::convert;
 use crate::library::{Described, Failure, ItemState, Job, JobItem, LibraryError};
 use crate::pipeline::Description;
+use crate::store::StoreError;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -21,6 +22,15 @@ use tokio::task::JoinSet;
 
 /// What describing came to.
 type Outcome = Result<Described, Failure>;
+
+/// A shape on its way to its lane.
+enum Prepared {
+    /// It was described, or failed to be.
+    Described(Outcome),
+    /// When its turn to be described came, no description was needed: the same bytes were there under its
+    /// name, or others that it may not replace. Looked at again when its turn to be placed comes.
+    NotNeeded,
+}
 
 /// What a lane is told.
 pub(crate) enum Step {
@@ -34,7 +44,7 @@ pub(crate) enum Step {
 pub(crate) struct Ready {
     item: JobItem,
     /// Dropped without a value if the daemon drains: the shape stays queued in the catalog.
-    described: oneshot::Receiver<(Outcome, Reservation)>,
+    prepared: oneshot::Receiver<(Prepared, Reservation)>,
 }
 
 /// Delay before a failed write is tried again, doubled each time.
@@ -167,26 +177,38 @@ async fn hand_out(daemon: &Arc<Daemon>) {
             }
         };
         let memory = daemon.describe_memory.reserve(Limits::to_describe(waiting.n_bytes)).await;
-        let (sender, described) = oneshot::channel();
+        let (sender, prepared) = oneshot::channel();
         // Told before describing begins, so that the lane has its shapes in order of acceptance.
-        if lane.send(Step::Place(Ready { item: waiting.item.clone(), described })).is_err() {
+        if lane.send(Step::Place(Ready { item: waiting.item.clone(), prepared })).is_err() {
             continue;
         }
         let daemon = Arc::clone(daemon);
         tokio::task::spawn_blocking(move || {
-            let outcome = describe(&daemon, &waiting.item);
-            drop(worker);
             let mut memory = memory;
-            if let Ok(d) = &outcome {
-                memory.shrink_to(bytes_of(&d.description));
-            } else {
-                memory.shrink_to(0);
+            let prepared = prepare(&daemon, &waiting.item);
+            drop(worker);
+            match &prepared {
+                Prepared::Described(Ok(d)) => memory.shrink_to(bytes_of(&d.description)),
+                Prepared::NotNeeded => memory.shrink_to(0),
+                Prepared::Described(Err(_)) => {
+                    memory.shrink_to(0);
+                    // Stopped, it seems: it is described again at the next start.
+                    if daemon.is_draining() {
+                        return;
+                    }
+                }
             }
-            // An abandoned description is made again at the next start.
-            if !daemon.is_draining() || outcome.is_ok() {
-                let _ = sender.send((outcome, memory));
-            }
+            // The lane is gone only if the daemon drains.
+            let _ = sender.send((prepared, memory));
         });
+    }
+}
+
+fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
+    match daemon.library.needs_description(item) {
+        Ok(false) => Prepared::NotNeeded,
+        Ok(true) => Prepared::Described(describe(daemon, item)),
+        Err(e) => Prepared::Described(Err(convert::library_failure(&e))),
     }
 }
 
@@ -205,15 +227,11 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
     match outcome {
         Ok(Ok(described)) => Ok(described),
         Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
-        Ok(Err(_)) if begin.elapsed() >= limit => Err(Failure {
-            code: "DEADLINE_EXCEEDED".to_owned(),
-            reason: "SHAPE_TIMEOUT".to_owned(),
-            message: format!(
-                "describing it took {:.0} s, the limit is {} s",
-                begin.elapsed().as_secs_f64(),
-                limit.as_secs()
-            ),
-        }),
+        Ok(Err(_)) if begin.elapsed() >= limit => {
+            let (found, limit) = (begin.elapsed().as_secs_f64(), limit.as_secs());
+            let message = format!("describing it took {found:.0} s, the limit is {limit} s");
+            Err(failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message))
+        }
         Ok(Err(failure)) => Err(failure),
         Err(panic) => Err(panicked(&panic_text(panic.as_ref()))),
     }
@@ -232,20 +250,17 @@ fn bytes_of(d: &Description) -> u64 {
     (4 * (floats + integers) + 12 * triples + 8 * d.eigenvalues.len()) as u64
 }
 
+fn failed(code: &str, reason: &str, message: String) -> Failure {
+    Failure { code: code.to_owned(), reason: reason.to_owned(), message, subject: None }
+}
+
 fn cancelled() -> Failure {
-    Failure {
-        code: "CANCELLED".to_owned(),
-        reason: "JOB_CANCELLED".to_owned(),
-        message: "the job was cancelled before this shape was placed".to_owned(),
-    }
+    let message = "the job was cancelled before this shape was placed".to_owned();
+    failed("CANCELLED", "CANCELLED", message)
 }
 
 fn panicked(text: &str) -> Failure {
-    Failure {
-        code: "INTERNAL".to_owned(),
-        reason: "PANIC".to_owned(),
-        message: format!("the work on this shape panicked: {text}"),
-    }
+    failed("INTERNAL", "PANIC", format!("the work on this shape panicked: {text}"))
 }
 
 /// A collection's lane.
@@ -274,22 +289,39 @@ async fn place_in_order(
                 continue;
             }
         };
-        let described = loop {
-            match ready.described.try_recv() {
-                Ok(described) => break Ok(described),
+        let prepared = loop {
+            match ready.prepared.try_recv() {
+                Ok(prepared) => break Ok(prepared),
                 Err(oneshot::error::TryRecvError::Empty) if relabel => {
                     relabel = relabel_next(&daemon, &collection).await;
                 }
-                Err(_) => break (&mut ready.described).await,
+                Err(_) => break (&mut ready.prepared).await,
             }
         };
         // Draining: this shape and all after it stay queued.
-        let Ok((outcome, _memory)) = described else { return };
+        let Ok((prepared, _memory)) = prepared else { return };
+        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else { return };
         if !place(&daemon, &ready.item, outcome).await {
             return;
         }
         relabel = true;
     }
+}
+
+/// What is to be placed, now that all before it are. `None`: the daemon drains.
+async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
+    if let Prepared::Described(outcome) = prepared {
+        return Some(outcome);
+    }
+    let subject = item.clone();
+    // A shape before it may have removed the reason why no description was needed.
+    let settled = blocking(daemon, move |d| match prepare(d, &subject) {
+        Prepared::Described(outcome) => outcome,
+        // The library sees by itself why, before it looks at this.
+        Prepared::NotNeeded => Err(failed("INTERNAL", "GONE", "it was not described".to_owned())),
+    });
+    let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
+    (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
 }
 
 /// Places one shape and commits. False: the daemon drains and the shape stays queued.
@@ -309,8 +341,10 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
                 report(daemon, item, &state);
                 break;
             }
-            // Written nothing, or not durably: the disk may come back, and the shape is still queued.
-            Ok(Err(LibraryError::Store(e))) => {
+            // Nothing was written: there may be space again, or a restart, and the shape is still queued.
+            Ok(Err(LibraryError::Store(
+                e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
+            ))) => {
                 tracing::error!(
                     collection = item.collection, shape = item.name, error = %e,
                     "a shape cannot be stored; trying again in {} s", delay.as_secs()

@@ -2,7 +2,7 @@
 
 use crate::ipc::frames::FrameError;
 use crate::ipc::wire::{Error, ErrorCode, ErrorReason, error::Subject};
-use crate::library::{Failure, LibraryError};
+use crate::library::{Failure, FailureSubject, LibraryError};
 use crate::store::StoreError;
 
 /// Milliseconds after which a full disk is worth another try.
@@ -70,36 +70,35 @@ pub fn library_error(e: &LibraryError) -> Error {
         LibraryError::FailedPrecondition { reason: name, .. } => {
             error(ErrorCode::FailedPrecondition, reason(name), message)
         }
-        LibraryError::DataLoss { .. } => {
-            error(ErrorCode::DataLoss, ErrorReason::StoreDamaged, message)
-        }
+        LibraryError::Refused(why) => failure(why),
         LibraryError::Store(e) => store_error(e, message),
     }
 }
 
 fn store_error(e: &StoreError, message: String) -> Error {
     match e {
-        StoreError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => Error {
+        StoreError::NoSpace { .. } => Error {
             retry_after_ms: DISK_FULL_RETRY_MS,
-            ..error(ErrorCode::ResourceExhausted, ErrorReason::StoreIo, message)
+            ..error(ErrorCode::ResourceExhausted, ErrorReason::NoSpace, message)
         },
-        StoreError::Io { .. } | StoreError::Catalog(_) => {
-            error(ErrorCode::Internal, ErrorReason::StoreIo, message)
-        }
-        StoreError::Damaged { .. } => error(ErrorCode::DataLoss, ErrorReason::StoreDamaged, message),
         StoreError::ReadOnly { .. } => {
             error(ErrorCode::FailedPrecondition, ErrorReason::ReadOnly, message)
         }
-        StoreError::Locked { .. } | StoreError::Version { .. } => {
-            error(ErrorCode::FailedPrecondition, ErrorReason::Unspecified, message)
-        }
+        e if e.is_damage() => error(ErrorCode::DataLoss, ErrorReason::Damaged, message),
+        _ => error(ErrorCode::Internal, ErrorReason::Store, message),
     }
 }
 
 /// Why one shape of a job failed.
 pub fn failure(f: &Failure) -> Error {
     let code = ErrorCode::from_str_name(&format!("ERROR_CODE_{}", f.code));
-    error(code.unwrap_or(ErrorCode::Internal), reason(&f.reason), f.message.clone())
+    let error = error(code.unwrap_or(ErrorCode::Internal), reason(&f.reason), f.message.clone());
+    let subject = f.subject.map(|subject| match subject {
+        FailureSubject::Face(i) => Subject::Face(i),
+        FailureSubject::Vertex(i) => Subject::Vertex(i),
+        FailureSubject::Line(i) => Subject::Line(i),
+    });
+    Error { subject, ..error }
 }
 
 /// The failure of a shape whose placing the library refused.
@@ -110,6 +109,7 @@ pub fn library_failure(e: &LibraryError) -> Failure {
         code: strip(wire.code().as_str_name(), "ERROR_CODE_"),
         reason: strip(wire.reason().as_str_name(), "ERROR_REASON_"),
         message: wire.message,
+        subject: None,
     }
 }
 
@@ -136,7 +136,9 @@ mod tests {
             code: "INVALID_ARGUMENT".to_owned(),
             reason: "NON_FINITE_VERTEX".to_owned(),
             message: "vertex 3 is NaN".to_owned(),
+            subject: Some(crate::library::FailureSubject::Vertex(3)),
         });
         assert_eq!((e.code(), e.reason()), (ErrorCode::InvalidArgument, ErrorReason::NonFiniteVertex));
+        assert_eq!(e.subject, Some(super::Subject::Vertex(3)));
     }
 }
