@@ -57,6 +57,17 @@ pub enum StartError {
     Threads(#[from] std::io::Error),
 }
 
+impl StartError {
+    /// Whether the configuration or the command line must be changed.
+    pub fn is_configuration(&self) -> bool {
+        match self {
+            Self::Config(_) => true,
+            Self::Endpoint(e) => !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. }),
+            Self::Library { .. } | Self::Socket { .. } | Self::Threads(_) => false,
+        }
+    }
+}
+
 /// Counts since the start.
 #[derive(Default)]
 struct Counters {

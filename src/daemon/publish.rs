@@ -6,7 +6,6 @@
 use crate::daemon::{Daemon, blocking};
 use crate::ipc::wire::{self, event::Kind};
 use crate::ipc::{HEARTBEAT_TOPIC, convert, topic};
-use crate::library::LibraryError;
 use prost::Message as _;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,8 +22,8 @@ const HEARTBEAT: Duration = Duration::from_secs(1);
 pub(crate) enum Notice {
     /// Something may have been committed to the collection.
     Changed(String),
-    /// The collection is gone; one of the same name starts a new log.
-    Deleted(String),
+    /// The collection was created, which the event with this number says.
+    Created(String, u64),
     /// Nothing more will be committed.
     Stop,
 }
@@ -43,8 +42,10 @@ pub(crate) async fn run(
                 Some(Notice::Changed(collection)) => {
                     catch_up(&daemon, collection, &mut published).await;
                 }
-                Some(Notice::Deleted(collection)) => {
-                    published.remove(&collection);
+                Some(Notice::Created(collection, sequence)) => {
+                    // The log may hold events of an earlier collection of the name.
+                    published.entry(collection.clone()).or_insert(sequence.saturating_sub(1));
+                    catch_up(&daemon, collection, &mut published).await;
                 }
                 Some(Notice::Stop) | None => return,
             },
@@ -62,10 +63,6 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
             blocking(daemon, move |d| d.library.events_since(&name, after, BATCH)).await;
         let events = match events {
             Ok(Ok(events)) => events,
-            Ok(Err(LibraryError::NotFound { .. })) => {
-                published.remove(&collection);
-                return;
-            }
             Ok(Err(e)) => {
                 tracing::error!(collection, error = %e, "the event log cannot be read");
                 return;
@@ -81,8 +78,6 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
             published.insert(collection.clone(), event.sequence);
         }
         if events.len() < BATCH {
-            // Also a collection without events is in the heartbeat.
-            published.entry(collection).or_insert(after);
             return;
         }
     }

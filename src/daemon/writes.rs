@@ -62,14 +62,14 @@ pub(crate) fn change(
             })?;
             let spec = convert::collection_spec(spec, "spec")?;
             let info = library.create_collection(&spec, key).map_err(refuse)?;
-            daemon.notice(Notice::Changed(spec.name));
+            daemon.notice(Notice::Created(spec.name, info.sequence));
             let collection = Some(convert::collection(&info));
             Reply::CreateCollection(wire::CreateCollectionReply { collection })
         }
         Body::DeleteCollection(r) => {
             library.delete_collection(&r.collection, key).map_err(refuse)?;
             daemon.work.progress().remove_idle_lane(&r.collection);
-            daemon.notice(Notice::Deleted(r.collection.clone()));
+            daemon.notice(Notice::Changed(r.collection.clone()));
             Reply::DeleteCollection(wire::DeleteCollectionReply {})
         }
         Body::NameLabel(r) => {
@@ -179,8 +179,8 @@ fn ensure_collection(
             }
         },
         Err(LibraryError::NotFound { .. }) => {
-            daemon.library.create_collection(&spec, None).map_err(refuse)?;
-            daemon.notice(Notice::Changed(name.to_owned()));
+            let info = daemon.library.create_collection(&spec, None).map_err(refuse)?;
+            daemon.notice(Notice::Created(name.to_owned(), info.sequence));
             Ok(())
         }
         Err(e) => Err(refuse(e)),
