@@ -72,8 +72,8 @@ pub fn serve(
     );
     notify(&[NotifyState::Ready, NotifyState::Status("serving")]);
     attend(&running, reload);
-    notify(&[NotifyState::Stopping, NotifyState::Status("draining")]);
     tracing::info!("draining");
+    notify(&[NotifyState::Stopping, NotifyState::Status("draining")]);
     running.drain(DRAIN);
     tracing::info!("drained");
     Ok(())
