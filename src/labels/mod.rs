@@ -4,6 +4,7 @@
 //! collection has learnt of its labels. [`cut`] turns per-face evidence into a labelling with short
 //! boundaries along concave creases.
 
+mod boundary;
 mod candidates;
 mod criterion;
 pub mod cut;
@@ -12,6 +13,7 @@ mod features;
 mod joint;
 mod model;
 
+pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
