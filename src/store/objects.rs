@@ -30,6 +30,9 @@ const ZSTD_LEVEL: i32 = 3;
 
 const TEMPORARY: &str = "tmp";
 
+/// The folders that hold object files, or what is to become one.
+pub(super) const FOLDERS: [&str; 3] = ["objects", "originals", TEMPORARY];
+
 /// The object files of one library.
 pub struct Objects {
     disk: Arc<dyn Disk>,
@@ -81,7 +84,7 @@ impl Objects {
                 cache_bytes: DEFAULT_CACHE_BYTES,
             }),
         };
-        for folder in ["objects", "originals", TEMPORARY] {
+        for folder in FOLDERS {
             let path = root.join(folder);
             objects
                 .disk
@@ -125,14 +128,7 @@ impl Objects {
         if let Some(mapped) = self.cached(&row.file, row.blake3) {
             return Ok(mapped);
         }
-        let path = self.root.join(&row.file);
-        let mapped = match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
-            Ok(mapped) => mapped,
-            Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
-                return Err(StoreError::io(&path, e));
-            }
-            Err(e) => return Err(damaged(&row.file, e)),
-        };
+        let mapped = map_description(&self.root, row)?;
         let mut state = self.state();
         state
             .cache
@@ -143,33 +139,7 @@ impl Objects {
 
     /// The bytes a row names, as they were put.
     pub fn original(&self, row: &ObjectRow) -> Result<Vec<u8>, StoreError> {
-        let path = self.root.join(&row.file);
-        let stored = match self.disk.read(&path) {
-            Ok(stored) => stored,
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
-            Err(e) => return Err(StoreError::io(&path, e)),
-        };
-        if stored.len() as u64 != row.length {
-            let (found, expected) = (stored.len(), row.length);
-            let message = format!("the file has {found} bytes, but the catalog says {expected}");
-            return Err(damaged(&row.file, message));
-        }
-        let found = Digest::of(&stored);
-        if found != row.blake3 {
-            let expected = row.blake3;
-            let message = format!("the file's BLAKE3 is {found}, but the catalog says {expected}");
-            return Err(damaged(&row.file, message));
-        }
-        let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
-        let found = Digest::of(&bytes);
-        if found != row.digest {
-            let message = format!(
-                "its content's BLAKE3 is {found}, but its name is {}",
-                row.digest
-            );
-            return Err(damaged(&row.file, message));
-        }
-        Ok(bytes)
+        read_original(&*self.disk, &self.root, row)
     }
 
     /// Bounds the bytes that stay mapped between uses; 0 keeps nothing mapped.
@@ -199,7 +169,7 @@ impl Objects {
             .held
             .retain(|_, since| since.elapsed() < min_age);
         let mut swept = Vec::new();
-        for folder in ["objects", "originals", TEMPORARY] {
+        for folder in FOLDERS {
             let path = self.root.join(folder);
             for entry in self
                 .disk
@@ -396,6 +366,50 @@ impl State {
             total -= self.cache.remove(0).2.file_len();
         }
     }
+}
+
+/// Maps the array file of a row; a file that is missing or wrong is damage.
+pub(super) fn map_description(
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<MappedDescription, StoreError> {
+    let path = root.join(&row.file);
+    match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
+        Ok(mapped) => Ok(mapped),
+        Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
+            Err(StoreError::io(&path, e))
+        }
+        Err(e) => Err(damaged(&row.file, e)),
+    }
+}
+
+/// Reads the original of a row; a file that is missing or wrong is damage.
+pub(super) fn read_original(
+    disk: &dyn Disk,
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<Vec<u8>, StoreError> {
+    let path = root.join(&row.file);
+    let stored = match disk.read(&path) {
+        Ok(stored) => stored,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
+        Err(e) => return Err(StoreError::io(&path, e)),
+    };
+    let (found, expected) = (stored.len() as u64, row.length);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Length { found, expected }));
+    }
+    let (found, expected) = (Digest::of(&stored), row.blake3);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Digest { found, expected }));
+    }
+    let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
+    let found = Digest::of(&bytes);
+    if found != row.digest {
+        let message = format!("its content's BLAKE3 is {found}, but its name is {}", row.digest);
+        return Err(damaged(&row.file, message));
+    }
+    Ok(bytes)
 }
 
 /// The name of a file below the library's folder, as the catalog has it.
