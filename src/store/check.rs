@@ -39,18 +39,18 @@ struct Arrays {
 /// Damage is found, not an error: errors are reserved for what keeps it from being looked for. It
 /// takes about as long as reading all files once.
 pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
-    let mut findings = Findings(Vec::new());
+    let mut findings = Findings::default();
     let path = catalog::path_in(dir);
     std::fs::metadata(dir).map_err(|e| StoreError::io(dir, e))?;
     if !path.is_file() {
         findings.damage(CATALOG_FILE, "the catalog is missing");
-        return Ok(findings.0);
+        return Ok(findings.list);
     }
     let connection = match catalog::open_reader(&path) {
         Ok(connection) => connection,
         Err(error) if error.is_damage() => {
             findings.error(&error);
-            return Ok(findings.0);
+            return Ok(findings.list);
         }
         Err(error) => return Err(error),
     };
@@ -82,18 +82,21 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     findings.take("jobs", |f| check_jobs(&connection, &reader, f));
     drop(connection);
     check_orphans(dir, &rows, &path, &mut findings)?;
-    Ok(findings.0)
+    Ok(findings.list)
 }
 
-/// Findings so far.
-struct Findings(Vec<Finding>);
+/// Findings so far, each once: one cause may be met on several ways.
+#[derive(Default)]
+struct Findings {
+    list: Vec<Finding>,
+    seen: HashSet<(String, String)>,
+}
 
 impl Findings {
     fn damage(&mut self, place: impl Into<String>, message: impl Into<String>) {
         let (place, message) = (place.into(), message.into());
-        let finding = Finding { place, message, damage: true };
-        if !self.0.contains(&finding) {
-            self.0.push(finding);
+        if self.seen.insert((place.clone(), message.clone())) {
+            self.list.push(Finding { place, message, damage: true });
         }
     }
 
@@ -416,7 +419,7 @@ fn check_orphans(
                 continue;
             }
             let message = format!("{} bytes that no row names", entry.length);
-            findings.0.push(Finding { place: file, message, damage: false });
+            findings.list.push(Finding { place: file, message, damage: false });
         }
     }
     Ok(())

@@ -38,6 +38,8 @@ pub struct Objects {
     disk: Arc<dyn Disk>,
     root: PathBuf,
     health: Health,
+    /// One file is published at a time, so that nobody finds a name that may yet be taken back.
+    publishing: Mutex<()>,
     state: Mutex<State>,
 }
 
@@ -76,6 +78,7 @@ impl Objects {
             disk,
             root: root.to_path_buf(),
             health,
+            publishing: Mutex::new(()),
             state: Mutex::new(State {
                 held: HashMap::new(),
                 durable_folders: HashSet::new(),
@@ -206,6 +209,7 @@ impl Objects {
         self.health.writable()?;
         let hex = digest.to_string();
         let folder = format!("{}/{}", kind.folder(), &hex[..2]);
+        let _publishing = self.publishing.lock().unwrap_or_else(PoisonError::into_inner);
         self.make_folder(kind.folder(), &folder)?;
 
         let blake3 = Digest::of(bytes);
@@ -216,13 +220,9 @@ impl Objects {
             self.hold([file.clone()]);
             let path = self.root.join(&file);
             match self.disk.read(&path) {
+                // Durable: it was synced before it got this name, and the name was there when
+                // `make_folder` synced the folder, or was published since.
                 Ok(stored) if same(&stored) => {
-                    // The file was synced before it got this name, but an earlier process may have
-                    // ended before the name was durable.
-                    let folder = self.root.join(&folder);
-                    self.disk
-                        .sync_dir(&folder)
-                        .map_err(|e| self.health.stop(format!("fsync {folder:?}: {e}")))?;
                     let (length, blake3) = (stored.len() as u64, Digest::of(&stored));
                     return Ok(ObjectRow {
                         kind,
@@ -252,27 +252,27 @@ impl Objects {
         ))
     }
 
-    /// Makes the folder of a two-digit prefix, its name durable.
+    /// Makes the folder of a two-digit prefix. Once per process both its own name and the names in
+    /// it are synced: an earlier process may have ended between a rename and its sync.
     fn make_folder(&self, parent: &str, folder: &str) -> Result<(), StoreError> {
         if self.state().durable_folders.contains(folder) {
             return Ok(());
         }
         let path = self.root.join(folder);
-        let created = self
-            .disk
-            .create_dir(&path)
-            .map_err(|e| StoreError::io(&path, e))?;
+        let created = self.disk.create_dir(&path).map_err(|e| StoreError::io(&path, e))?;
         let parent = self.root.join(parent);
-        if let Err(e) = self.disk.sync_dir(&parent) {
+        let synced = self.disk.sync_dir(&parent).and_then(|()| match created {
+            true => Ok(()),
+            false => self.disk.sync_dir(&path),
+        });
+        if let Err(e) = synced {
             // Once the folder is gone again, the next attempt starts from the beginning; a folder
             // that was there before cannot be taken back.
-            return Err(
-                if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
-                    StoreError::io(&parent, e)
-                } else {
-                    self.health.stop(format!("fsync {}: {e}", parent.display()))
-                },
-            );
+            return Err(if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
+                StoreError::io(&parent, e)
+            } else {
+                self.health.stop(format!("fsync {}: {e}", path.display()))
+            });
         }
         self.state().durable_folders.insert(folder.to_string());
         Ok(())
@@ -426,3 +426,6 @@ fn damaged(file: &str, message: impl ToString) -> StoreError {
         message: message.to_string(),
     }
 }
+
+#[cfg(test)]
+mod tests;
