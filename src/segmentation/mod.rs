@@ -1,1 +1,7 @@
-//! (being written)
+//! One shape's faces become patches and parts, before anything is known of other shapes.
+
+mod parts;
+mod surface;
+
+pub use parts::{PartGraph, merge_patches};
+pub use surface::{PatchGraph, Surface, SurfaceEdge};
