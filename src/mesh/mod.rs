@@ -1,5 +1,7 @@
 //! Bytes of a mesh file become a clean, normalised triangle mesh at working resolution.
 
+pub mod write;
+
 /// A triangle mesh: `vertices (n, 3)`, `faces (m, 3)`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TriMesh {
