@@ -70,8 +70,15 @@ fn parse_family(name: &str) -> Result<Family, UnknownFamily> {
 
 /// Writes the shapes, or lists the families, and prints what was done.
 pub fn run(args: &SynthArgs) -> Result<(), SynthError> {
-    let text = if args.list { list(args.json) } else { write_family(args)? };
-    std::io::stdout().lock().write_all(text.as_bytes()).map_err(SynthError::Print)
+    let text = if args.list {
+        list(args.json)
+    } else {
+        write_family(args)?
+    };
+    std::io::stdout()
+        .lock()
+        .write_all(text.as_bytes())
+        .map_err(SynthError::Print)
 }
 
 /// The families with their parts.
@@ -86,8 +93,13 @@ fn list(as_json: bool) -> String {
     let mut text = String::new();
     for family in Family::ALL {
         let names = family.label_names();
-        writeln!(text, "{family:<12}{} parts: {}", names.len(), names.join(", "))
-            .expect("invariant: writing to a string cannot fail");
+        writeln!(
+            text,
+            "{family:<12}{} parts: {}",
+            names.len(),
+            names.join(", ")
+        )
+        .expect("invariant: writing to a string cannot fail");
     }
     text
 }
@@ -95,9 +107,14 @@ fn list(as_json: bool) -> String {
 fn write_family(args: &SynthArgs) -> Result<String, SynthError> {
     let family = args.family.ok_or(SynthError::Missing("the family"))?;
     let out = args.out.as_deref().ok_or(SynthError::Missing("--out"))?;
-    std::fs::create_dir_all(out)
-        .map_err(|source| SynthError::Write { path: out.to_path_buf(), source })?;
-    let options = Options { n_faces: args.faces, rotate: args.rotate };
+    std::fs::create_dir_all(out).map_err(|source| SynthError::Write {
+        path: out.to_path_buf(),
+        source,
+    })?;
+    let options = Options {
+        n_faces: args.faces,
+        rotate: args.rotate,
+    };
     let written: Result<Vec<Value>, SynthError> = (0..args.count)
         .into_par_iter()
         .map(|index| {
@@ -113,7 +130,11 @@ fn write_family(args: &SynthArgs) -> Result<String, SynthError> {
         })
         .collect();
     let written = written?;
-    let names: String = family.label_names().iter().map(|n| format!("{n}\n")).collect();
+    let names: String = family
+        .label_names()
+        .iter()
+        .map(|n| format!("{n}\n"))
+        .collect();
     write(&out.join("LABEL_NAMES.txt"), &names)?;
     if args.json {
         let report = json!({
@@ -127,12 +148,16 @@ fn write_family(args: &SynthArgs) -> Result<String, SynthError> {
     }
     let n_parts = family.label_names().len();
     let (n, path) = (written.len(), out.display());
-    Ok(format!("{n} shapes of family {family} ({n_parts} parts) in {path}\n"))
+    Ok(format!(
+        "{n} shapes of family {family} ({n_parts} parts) in {path}\n"
+    ))
 }
 
 fn write(path: &Path, text: &str) -> Result<(), SynthError> {
-    std::fs::write(path, text)
-        .map_err(|source| SynthError::Write { path: path.to_path_buf(), source })
+    std::fs::write(path, text).map_err(|source| SynthError::Write {
+        path: path.to_path_buf(),
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -150,8 +175,16 @@ mod tests {
     fn writes_a_mesh_and_its_labels() {
         let dir = tempfile::tempdir().unwrap();
         let out = dir.path().join("new/pliers");
-        let typed =
-            ["synth", "pliers", "--count", "2", "--faces", "1000", "--out", out.to_str().unwrap()];
+        let typed = [
+            "synth",
+            "pliers",
+            "--count",
+            "2",
+            "--faces",
+            "1000",
+            "--out",
+            out.to_str().unwrap(),
+        ];
         run(&Cli::try_parse_from(typed).unwrap().synth).unwrap();
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .unwrap()

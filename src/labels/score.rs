@@ -92,7 +92,13 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     let col_of: HashMap<i32, usize> = (0..n_cols).map(|j| (true_labels[j], j)).collect();
     let mut overlap = vec![0.0; n_rows * n_cols];
     for (shape, share) in shapes.iter().zip(&shares) {
-        for ((p, t), a) in shape.predicted.unwrap_or(&[]).iter().zip(shape.truth).zip(share) {
+        for ((p, t), a) in shape
+            .predicted
+            .unwrap_or(&[])
+            .iter()
+            .zip(shape.truth)
+            .zip(share)
+        {
             if let Some(i) = row_of.get(p) {
                 overlap[i * n_cols + col_of[t]] += a;
             }
@@ -109,8 +115,16 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
         .iter()
         .zip(&shares)
         .map(|(shape, share)| {
-            let faces = shape.predicted.unwrap_or(&[]).iter().zip(shape.truth).zip(share);
-            faces.filter(|((p, t), _)| pairs.get(p) == Some(t)).map(|(_, a)| a).sum()
+            let faces = shape
+                .predicted
+                .unwrap_or(&[])
+                .iter()
+                .zip(shape.truth)
+                .zip(share);
+            faces
+                .filter(|((p, t), _)| pairs.get(p) == Some(t))
+                .map(|(_, a)| a)
+                .sum()
         })
         .collect();
     let best_of_row = |row: &[f64]| row.iter().copied().fold(0.0, f64::max);
@@ -132,13 +146,22 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
 }
 
 fn distinct<'a>(labels: impl Iterator<Item = &'a i32>) -> Vec<i32> {
-    labels.copied().collect::<BTreeSet<_>>().into_iter().collect()
+    labels
+        .copied()
+        .collect::<BTreeSet<_>>()
+        .into_iter()
+        .collect()
 }
 
 /// Each face's share of the shape's area, summing to 1.
 fn area_shares(i: usize, shape: &ScoredShape<'_>) -> Result<Vec<f64>, ScoreError> {
     let n_faces = shape.mesh.faces.len();
-    let count = |which, n_labels| ScoreError::Count { shape: i, which, n_labels, n_faces };
+    let count = |which, n_labels| ScoreError::Count {
+        shape: i,
+        which,
+        n_labels,
+        n_faces,
+    };
     if shape.truth.len() != n_faces {
         return Err(count("true", shape.truth.len()));
     }
@@ -162,7 +185,10 @@ fn area_shares(i: usize, shape: &ScoredShape<'_>) -> Result<Vec<f64>, ScoreError
         .collect();
     let total: f64 = areas.iter().sum();
     if !(total > 0.0 && total.is_finite()) {
-        return Err(ScoreError::Area { shape: i, area: total.to_string() });
+        return Err(ScoreError::Area {
+            shape: i,
+            area: total.to_string(),
+        });
     }
     Ok(areas.into_iter().map(|a| a / total).collect())
 }
@@ -179,7 +205,8 @@ pub fn rand_error(mesh: &TriMesh, one: &[i32], other: &[i32]) -> f64 {
         return 0.0;
     }
     let (s, t) = (pieces(&mesh.faces, one), pieces(&mesh.faces, other));
-    let squares = |counts: BTreeMap<(usize, usize), f64>| counts.values().map(|c| c * c).sum::<f64>();
+    let squares =
+        |counts: BTreeMap<(usize, usize), f64>| counts.values().map(|c| c * c).sum::<f64>();
     let mut joint = BTreeMap::new();
     let (mut first, mut second) = (BTreeMap::new(), BTreeMap::new());
     for (&a, &b) in s.iter().zip(&t) {
@@ -226,7 +253,10 @@ mod tests {
 
     /// A strip of right triangles along x whose areas are `widths / 2`.
     fn strip(widths: &[f64]) -> TriMesh {
-        let mut mesh = TriMesh { vertices: vec![[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], faces: vec![] };
+        let mut mesh = TriMesh {
+            vertices: vec![[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+            faces: vec![],
+        };
         let mut ends = [0.0, 0.0];
         for (i, w) in widths.iter().enumerate() {
             let n = mesh.vertices.len() as u32;
@@ -252,8 +282,16 @@ mod tests {
         let truth = [0, 0, 1, 1];
         let (p1, p2) = ([7, 7, 3, 3], [3, 3, 7, 3]);
         let shapes = [
-            ScoredShape { mesh: &mesh, truth: &truth, predicted: Some(&p1) },
-            ScoredShape { mesh: &mesh, truth: &truth, predicted: Some(&p2) },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&p1),
+            },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&p2),
+            },
         ];
         let s = score(&shapes).unwrap();
         // Pooled overlap: 7 with 0: .5, 7 with 1: .25, 3 with 0: .5, 3 with 1: .75.
@@ -262,13 +300,20 @@ mod tests {
         assert!((s.shapes[1] - 0.25).abs() < TOLERANCE);
         assert!((s.accuracy - 0.625).abs() < TOLERANCE);
         assert!((s.purity - 0.625).abs() < TOLERANCE);
-        assert_eq!((s.n_predicted_labels, s.n_true_labels, s.n_missing), (2, 2, 0));
+        assert_eq!(
+            (s.n_predicted_labels, s.n_true_labels, s.n_missing),
+            (2, 2, 0)
+        );
     }
 
     #[test]
     fn faces_weigh_by_area() {
         let mesh = strip(&[1.0, 3.0]);
-        let s = score(&[ScoredShape { mesh: &mesh, truth: &[0, 1], predicted: Some(&[5, 5]) }]);
+        let s = score(&[ScoredShape {
+            mesh: &mesh,
+            truth: &[0, 1],
+            predicted: Some(&[5, 5]),
+        }]);
         let s = s.unwrap();
         assert_eq!(s.assignment, [(5, 1)]);
         assert!((s.accuracy - 0.75).abs() < TOLERANCE);
@@ -277,7 +322,11 @@ mod tests {
     #[test]
     fn over_splitting_costs_accuracy_but_not_purity() {
         let mesh = strip(&[1.0; 4]);
-        let shape = ScoredShape { mesh: &mesh, truth: &[0, 0, 0, 1], predicted: Some(&[1, 1, 2, 3]) };
+        let shape = ScoredShape {
+            mesh: &mesh,
+            truth: &[0, 0, 0, 1],
+            predicted: Some(&[1, 1, 2, 3]),
+        };
         let s = score(&[shape]).unwrap();
         assert!((s.accuracy - 0.75).abs() < TOLERANCE);
         assert!((s.purity - 1.0).abs() < TOLERANCE);
@@ -288,14 +337,25 @@ mod tests {
         let mesh = strip(&[1.0; 4]);
         let truth = [0, 0, 1, 1];
         let shapes = [
-            ScoredShape { mesh: &mesh, truth: &truth, predicted: Some(&[0, -1, -1, 1]) },
-            ScoredShape { mesh: &mesh, truth: &truth, predicted: None },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&[0, -1, -1, 1]),
+            },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: None,
+            },
         ];
         let s = score(&shapes).unwrap();
         assert!((s.accuracy - 0.25).abs() < TOLERANCE);
         assert_eq!((s.n_missing, s.n_predicted_labels), (1, 2));
         let none = score(&shapes[1..]).unwrap();
-        assert_eq!((none.accuracy, none.purity, none.rand_error), (0.0, 0.0, None));
+        assert_eq!(
+            (none.accuracy, none.purity, none.rand_error),
+            (0.0, 0.0, None)
+        );
     }
 
     #[test]
@@ -314,14 +374,22 @@ mod tests {
     #[test]
     fn says_what_does_not_fit() {
         let mesh = strip(&[1.0; 4]);
-        let short = ScoredShape { mesh: &mesh, truth: &[0; 4], predicted: Some(&[0; 3]) };
+        let short = ScoredShape {
+            mesh: &mesh,
+            truth: &[0; 4],
+            predicted: Some(&[0; 3]),
+        };
         assert_eq!(
             score(&[short]).unwrap_err().to_string(),
             "shape 0 has 3 predicted labels, but the mesh has 4 faces"
         );
         assert_eq!(score(&[]), Err(ScoreError::Empty));
         let flat = strip(&[0.0]);
-        let flat = ScoredShape { mesh: &flat, truth: &[0], predicted: None };
+        let flat = ScoredShape {
+            mesh: &flat,
+            truth: &[0],
+            predicted: None,
+        };
         assert!(matches!(score(&[flat]), Err(ScoreError::Area { .. })));
     }
 }

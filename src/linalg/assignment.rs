@@ -14,7 +14,11 @@
 ///
 /// If `cost` does not hold `n_rows · n_cols` values, or one of them is not finite.
 pub fn assignment(cost: &[f64], n_rows: usize, n_cols: usize) -> Vec<Option<usize>> {
-    assert_eq!(cost.len(), n_rows * n_cols, "{n_rows} rows by {n_cols} columns");
+    assert_eq!(
+        cost.len(),
+        n_rows * n_cols,
+        "{n_rows} rows by {n_cols} columns"
+    );
     assert!(cost.iter().all(|c| c.is_finite()), "costs must be finite");
     if n_rows <= n_cols {
         let row_of_column = augment(n_rows, n_cols, |i, j| cost[i * n_cols + j]);
@@ -94,7 +98,10 @@ mod tests {
     const TOLERANCE: f64 = 1e-12;
 
     fn total(cost: &[f64], n_cols: usize, columns: &[Option<usize>]) -> f64 {
-        let pairs = columns.iter().enumerate().filter_map(|(i, j)| j.map(|j| (i, j)));
+        let pairs = columns
+            .iter()
+            .enumerate()
+            .filter_map(|(i, j)| j.map(|j| (i, j)));
         pairs.map(|(i, j)| cost[i * n_cols + j]).sum()
     }
 
@@ -136,7 +143,10 @@ mod tests {
                     assert_eq!(used.len(), n_rows.min(n_cols), "a column is used twice");
                     let expected = brute_force(&cost, n_rows, n_cols);
                     let found = total(&cost, n_cols, &columns);
-                    assert!((found - expected).abs() < TOLERANCE, "{n_rows}x{n_cols}: {cost:?}");
+                    assert!(
+                        (found - expected).abs() < TOLERANCE,
+                        "{n_rows}x{n_cols}: {cost:?}"
+                    );
                 }
             }
         }

@@ -10,7 +10,10 @@ use std::fmt::Write;
 pub fn off(mesh: &TriMesh) -> String {
     let mut out = String::with_capacity(60 * mesh.vertices.len() + 20 * mesh.faces.len());
     out.push_str("OFF\n");
-    line(&mut out, format_args!("{} {} 0", mesh.vertices.len(), mesh.faces.len()));
+    line(
+        &mut out,
+        format_args!("{} {} 0", mesh.vertices.len(), mesh.faces.len()),
+    );
     for [x, y, z] in &mesh.vertices {
         line(&mut out, format_args!("{x} {y} {z}"));
     }
@@ -72,7 +75,11 @@ pub fn mtl(colours: &[(i32, [u8; 3])]) -> String {
 }
 
 fn material(label: i32) -> String {
-    if label < 0 { "unlabelled".to_owned() } else { format!("label_{label}") }
+    if label < 0 {
+        "unlabelled".to_owned()
+    } else {
+        format!("label_{label}")
+    }
 }
 
 /// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and `int label`.
@@ -89,13 +96,21 @@ pub fn ply<P: AsRef<[u32]>>(
     assert_eq!(polygons.len(), colours.len(), "one colour per polygon");
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
     // A one-byte count is what most readers expect; it is widened only when a polygon needs it.
-    let wide = polygons.iter().any(|p| p.as_ref().len() > usize::from(u8::MAX));
+    let wide = polygons
+        .iter()
+        .any(|p| p.as_ref().len() > usize::from(u8::MAX));
     let count = if wide { "uint" } else { "uchar" };
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
-    line(&mut header, format_args!("element vertex {}", vertices.len()));
+    line(
+        &mut header,
+        format_args!("element vertex {}", vertices.len()),
+    );
     header.push_str("property double x\nproperty double y\nproperty double z\n");
     line(&mut header, format_args!("element face {}", polygons.len()));
-    line(&mut header, format_args!("property list {count} uint vertex_indices"));
+    line(
+        &mut header,
+        format_args!("property list {count} uint vertex_indices"),
+    );
     header.push_str("property uchar red\nproperty uchar green\nproperty uchar blue\n");
     header.push_str("property int label\nend_header\n");
     let mut out = header.into_bytes();
@@ -124,7 +139,8 @@ fn line(out: &mut String, text: std::fmt::Arguments<'_>) {
 }
 
 fn append(out: &mut String, text: std::fmt::Arguments<'_>) {
-    out.write_fmt(text).expect("invariant: writing to a string cannot fail");
+    out.write_fmt(text)
+        .expect("invariant: writing to a string cannot fail");
 }
 
 #[cfg(test)]
@@ -134,7 +150,12 @@ mod tests {
 
     fn two_triangles() -> TriMesh {
         TriMesh {
-            vertices: vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 1e-7, -2.5]],
+            vertices: vec![
+                [0.0, 0.0, 0.0],
+                [1.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0],
+                [0.1, 1e-7, -2.5],
+            ],
             faces: vec![[0, 1, 2], [2, 1, 3]],
         }
     }
@@ -169,14 +190,22 @@ mod tests {
             "f 1 2 4 3",
         ];
         assert_eq!(rest, expected);
-        assert_eq!(mtl(&[(4, [255, 0, 51])]), "newmtl label_4\nKd 1.0000 0.0000 0.2000\n");
+        assert_eq!(
+            mtl(&[(4, [255, 0, 51])]),
+            "newmtl label_4\nKd 1.0000 0.0000 0.2000\n"
+        );
         assert!(!obj(&mesh.vertices, &mesh.faces, &[0, 1], None).contains("mtl"));
     }
 
     #[test]
     fn ply_has_the_bytes_its_header_promises() {
         let mesh = two_triangles();
-        let bytes = ply(&mesh.vertices, &mesh.faces, &[[1, 2, 3], [4, 5, 6]], &[9, -1]);
+        let bytes = ply(
+            &mesh.vertices,
+            &mesh.faces,
+            &[[1, 2, 3], [4, 5, 6]],
+            &[9, -1],
+        );
         let end = b"end_header\n";
         let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
         let header = std::str::from_utf8(&bytes[..at]).unwrap();

@@ -11,7 +11,10 @@ pub(super) fn closed_manifold(mesh: &TriMesh) {
     for &[a, b, c] in &mesh.faces {
         for (u, v, w) in [(a, b, c), (b, c, a), (c, a, b)] {
             assert!(u != v, "a face uses vertex {u} twice");
-            assert!(next.insert((u, v), w).is_none(), "edge {u}-{v} has two faces on one side");
+            assert!(
+                next.insert((u, v), w).is_none(),
+                "edge {u}-{v} has two faces on one side"
+            );
             degree[u as usize] += 1;
         }
     }
@@ -42,7 +45,10 @@ pub(super) fn euler_characteristic(mesh: &TriMesh) -> i64 {
 
 /// Positive when faces are counter-clockwise seen from outside.
 pub(super) fn volume(mesh: &TriMesh) -> f64 {
-    let corners = mesh.faces.iter().map(|f| f.map(|v| mesh.vertices[v as usize]));
+    let corners = mesh
+        .faces
+        .iter()
+        .map(|f| f.map(|v| mesh.vertices[v as usize]));
     corners.map(|[a, b, c]| dot(a, cross(b, c)) / 6.0).sum()
 }
 

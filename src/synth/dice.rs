@@ -50,9 +50,21 @@ impl Dice {
             let s = 2.0 / n;
             let [w, x, y, z] = q;
             return [
-                [1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-                [s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)],
-                [s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)],
+                [
+                    1.0 - s * (y * y + z * z),
+                    s * (x * y - z * w),
+                    s * (x * z + y * w),
+                ],
+                [
+                    s * (x * y + z * w),
+                    1.0 - s * (x * x + z * z),
+                    s * (y * z - x * w),
+                ],
+                [
+                    s * (x * z - y * w),
+                    s * (y * z + x * w),
+                    1.0 - s * (x * x + y * y),
+                ],
             ];
         }
     }

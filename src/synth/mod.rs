@@ -7,6 +7,7 @@
 mod dice;
 mod families;
 mod field;
+mod parts;
 mod remesh;
 mod surface;
 mod vector;
@@ -16,20 +17,15 @@ mod check;
 #[cfg(test)]
 mod tests;
 
-use crate::labels::score::pieces;
 use crate::mesh::TriMesh;
 use dice::Dice;
 use field::Scene;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
-use std::collections::BTreeMap;
 use std::str::FromStr;
-use vector::{cross, dot, norm, scale, sub};
+use vector::{cross, dot, norm, sub};
 
 /// Fewest faces a shape is generated with; fewer cannot hold its handles and legs.
 pub const LEAST_FACES: u32 = 1_000;
-
-/// Pieces of one label below this share of the area are crumbs at a seam, not parts.
-const LEAST_PIECE: f64 = 0.002;
 
 /// Vertices are rounded to a millionth, so that files are short and read back as the same mesh.
 const DECIMALS: f64 = 1e6;
@@ -138,7 +134,10 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self { n_faces: 6_000, rotate: false }
+        Self {
+            n_faces: 6_000,
+            rotate: false,
+        }
     }
 }
 
@@ -157,14 +156,17 @@ pub struct Labelled {
 
 /// The first `count` members of a family for a seed, in order.
 pub fn family(family: Family, seed: u64, count: u32, options: &Options) -> Vec<Labelled> {
-    (0..count).into_par_iter().map(|index| generate(family, seed, index, options)).collect()
+    (0..count)
+        .into_par_iter()
+        .map(|index| generate(family, seed, index, options))
+        .collect()
 }
 
 /// Member `index` of a family for a seed; it does not depend on the other members.
 pub fn generate(family: Family, seed: u64, index: u32, options: &Options) -> Labelled {
     let scene = family.scene(&mut Dice::new(seed, family as u64, index, 0));
     let mut mesh = mesh_of(&scene, options.n_faces.max(LEAST_FACES) as usize);
-    let labels = labels_of(&scene, &mesh);
+    let labels = parts::labels(&scene, &mesh);
     if options.rotate {
         // Drawn from numbers of its own, so that turning does not change the shape.
         let rows = Dice::new(seed, family as u64, index, 1).rotation();
@@ -177,7 +179,12 @@ pub fn generate(family: Family, seed: u64, index: u32, options: &Options) -> Lab
         *x = (*x * DECIMALS).round() / DECIMALS + 0.0;
     }
     let name = format!("{family}-{:03}", u64::from(index) + 1);
-    Labelled { mesh, labels, label_names: family.label_names(), name }
+    Labelled {
+        mesh,
+        labels,
+        label_names: family.label_names(),
+        name,
+    }
 }
 
 /// The surface of a scene in about `n_faces` even triangles.
@@ -200,54 +207,4 @@ fn mesh_of(scene: &Scene, n_faces: usize) -> TriMesh {
 fn face_area(mesh: &TriMesh, face: &[u32; 3]) -> f64 {
     let [a, b, c] = face.map(|v| mesh.vertices[v as usize]);
     norm(cross(sub(b, a), sub(c, a))) / 2.0
-}
-
-/// The label of the primitive nearest to each face, without crumbs.
-fn labels_of(scene: &Scene, mesh: &TriMesh) -> Vec<u32> {
-    let centre = |face: &[u32; 3]| {
-        let [a, b, c] = face.map(|v| mesh.vertices[v as usize]);
-        scale([a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]], 1.0 / 3.0)
-    };
-    let mut labels: Vec<i32> = mesh.faces.iter().map(|f| scene.label(centre(f)) as i32).collect();
-    let areas: Vec<f64> = mesh.faces.iter().map(|f| face_area(mesh, f)).collect();
-    let least = LEAST_PIECE * areas.iter().sum::<f64>();
-    // The smallest crumb goes first, since it may join two pieces into a larger one.
-    while let Some((crumb, piece_of, label)) = smallest_crumb(mesh, &labels, &areas, least) {
-        for (face, piece) in piece_of.iter().enumerate() {
-            if *piece == crumb {
-                labels[face] = label;
-            }
-        }
-    }
-    labels.into_iter().map(|l| l as u32).collect()
-}
-
-/// The smallest piece below `least` that has a neighbour, the piece of each face, and the label it shares
-/// most edges with.
-fn smallest_crumb(
-    mesh: &TriMesh,
-    labels: &[i32],
-    areas: &[f64],
-    least: f64,
-) -> Option<(usize, Vec<usize>, i32)> {
-    let piece_of = pieces(&mesh.faces, labels);
-    let mut area_of: BTreeMap<usize, f64> = BTreeMap::new();
-    for (piece, area) in piece_of.iter().zip(areas) {
-        *area_of.entry(*piece).or_default() += area;
-    }
-    let small = area_of.iter().filter(|(_, area)| **area < least);
-    let (&crumb, _) = small.min_by(|a, b| a.1.total_cmp(b.1).then(a.0.cmp(b.0)))?;
-    let mut owner: BTreeMap<[u32; 2], usize> = BTreeMap::new();
-    for (f, &[a, b, c]) in mesh.faces.iter().enumerate() {
-        owner.extend([([a, b], f), ([b, c], f), ([c, a], f)]);
-    }
-    let mut shared: BTreeMap<i32, usize> = BTreeMap::new();
-    for (&[a, b], &f) in owner.iter().filter(|(_, f)| piece_of[**f] == crumb) {
-        let across = owner.get(&[b, a]).filter(|&&g| labels[g] != labels[f]);
-        if let Some(&g) = across {
-            *shared.entry(labels[g]).or_default() += 1;
-        }
-    }
-    let (&label, _) = shared.iter().max_by_key(|&(label, n)| (n, std::cmp::Reverse(label)))?;
-    Some((crumb, piece_of, label))
 }

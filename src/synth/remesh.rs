@@ -16,6 +16,11 @@ const N_FINAL_ROUNDS: usize = 3;
 /// Least cosine between a face before and after a step.
 const LEAST_COSINE: f64 = 0.3;
 
+/// An edge whose middle is nearer to the surface than this share of its length follows it well enough.
+const LEAST_GAP: f64 = 0.02;
+/// Aligning makes no angle smaller than that of this sine, 22°.
+const LEAST_SINE: f64 = 0.375;
+
 struct Mesh<'a> {
     scene: &'a Scene,
     /// Length that edges should have.
@@ -31,7 +36,11 @@ struct Mesh<'a> {
 /// Remeshes `mesh`, whose vertices are near the zero set of `scene`, to `n_faces` triangles (one less when
 /// odd). Where thin parts do not allow fewer without changing the topology, more are left.
 pub(super) fn remesh(mesh: TriMesh, scene: &Scene, n_faces: usize) -> TriMesh {
-    let area: f64 = mesh.faces.iter().map(|f| norm(double_area(&mesh.vertices, f)) / 2.0).sum();
+    let area: f64 = mesh
+        .faces
+        .iter()
+        .map(|f| norm(double_area(&mesh.vertices, f)) / 2.0)
+        .sum();
     // Equilateral triangles of edge l have area l²·√3/4.
     let target = (area / n_faces as f64 * 4.0 / 3f64.sqrt()).sqrt();
     let mut around = vec![Vec::with_capacity(6); mesh.vertices.len()];
@@ -42,7 +51,14 @@ pub(super) fn remesh(mesh: TriMesh, scene: &Scene, n_faces: usize) -> TriMesh {
     }
     let n_living = mesh.faces.len();
     let (vertices, faces) = (mesh.vertices, mesh.faces);
-    let mut m = Mesh { scene, target, vertices, faces, around, n_faces: n_living };
+    let mut m = Mesh {
+        scene,
+        target,
+        vertices,
+        faces,
+        around,
+        n_faces: n_living,
+    };
     for _ in 0..N_ROUNDS {
         m.split_longer_than(4.0 / 3.0 * target);
         m.collapse_shorter_than(0.8 * target, 0);
@@ -60,6 +76,9 @@ pub(super) fn remesh(mesh: TriMesh, scene: &Scene, n_faces: usize) -> TriMesh {
     for _ in 0..N_FINAL_ROUNDS {
         m.flip();
         m.smooth();
+    }
+    for _ in 0..N_FINAL_ROUNDS {
+        m.align();
     }
     m.compact()
 }
@@ -114,7 +133,9 @@ impl Mesh<'_> {
 
     fn neighbours(&self, v: u32) -> Vec<u32> {
         // Around a vertex of a closed oriented manifold each neighbour follows v in exactly one face.
-        let faces = self.around[v as usize].iter().map(|&f| self.faces[f as usize]);
+        let faces = self.around[v as usize]
+            .iter()
+            .map(|&f| self.faces[f as usize]);
         let next = |face: [u32; 3]| (0..3).find(|&k| face[k] == v).map(|k| face[(k + 1) % 3]);
         faces.filter_map(next).collect()
     }
@@ -138,9 +159,12 @@ impl Mesh<'_> {
     }
 
     fn split(&mut self, [a, b]: [u32; 2]) {
-        let Some((faces, thirds)) = self.sides([a, b]) else { return };
+        let Some((faces, thirds)) = self.sides([a, b]) else {
+            return;
+        };
         let m = self.vertices.len() as u32;
-        self.vertices.push(self.onto_surface(mix(self.at(a), self.at(b), 0.5)));
+        self.vertices
+            .push(self.onto_surface(mix(self.at(a), self.at(b), 0.5)));
         self.around.push(Vec::with_capacity(6));
         for ((f, c), (from, to)) in faces.into_iter().zip(thirds).zip([(a, b), (b, a)]) {
             let new = self.faces.len() as u32;
@@ -167,7 +191,9 @@ impl Mesh<'_> {
     }
 
     fn collapse(&mut self, [a, b]: [u32; 2]) {
-        let Some((dead, thirds)) = self.sides([a, b]) else { return };
+        let Some((dead, thirds)) = self.sides([a, b]) else {
+            return;
+        };
         // The link condition: the topology stays if the two share no neighbours but those across the edge.
         let near_a = self.neighbours(a);
         let near_b = self.neighbours(b);
@@ -179,7 +205,10 @@ impl Mesh<'_> {
         let middle = self.onto_surface(mix(self.at(a), self.at(b), 0.5));
         let reach = 4.0 / 3.0 * self.target;
         let all_near = near_a.iter().chain(&near_b).filter(|&&v| v != a && v != b);
-        if all_near.into_iter().any(|&v| norm(sub(self.at(v), middle)) > reach) {
+        if all_near
+            .into_iter()
+            .any(|&v| norm(sub(self.at(v), middle)) > reach)
+        {
             return;
         }
         for v in [a, b] {
@@ -210,7 +239,9 @@ impl Mesh<'_> {
     /// Flips edges where that brings valences nearer to six.
     fn flip(&mut self) {
         for (_, edge) in self.edges_by_length() {
-            let Some(([f, g], [c, d])) = self.sides(edge) else { continue };
+            let Some(([f, g], [c, d])) = self.sides(edge) else {
+                continue;
+            };
             let [a, b] = edge;
             let valence = |v: u32| self.around[v as usize].len() as i64;
             let off = |v: i64| (v - 6) * (v - 6);
@@ -227,15 +258,66 @@ impl Mesh<'_> {
                 let n = self.normal(face);
                 old.iter().any(|&o| dot(n, o) < 2.0 * LEAST_COSINE)
             });
-            if turned {
+            if !turned {
+                self.replace([f, g], new, edge, [c, d]);
+            }
+        }
+    }
+
+    /// Flips edges that cut through the solid, or bridge a hollow, to the other diagonal if that stays
+    /// nearer to the surface: along rounded edges and thin tubes that is the one along the edge.
+    fn align(&mut self) {
+        for (_, edge) in self.edges_by_length() {
+            let Some((faces, [c, d])) = self.sides(edge) else {
+                continue;
+            };
+            let [a, b] = edge;
+            let off = |u: u32, v: u32| self.scene.value(mix(self.at(u), self.at(v), 0.5)).abs();
+            let old = off(a, b);
+            if old < LEAST_GAP * self.target || off(c, d) > 0.6 * old {
                 continue;
             }
-            (self.faces[f as usize], self.faces[g as usize]) = (new[0], new[1]);
-            self.around[a as usize].retain(|&x| x != g);
-            self.around[b as usize].retain(|&x| x != f);
-            self.around[c as usize].push(g);
-            self.around[d as usize].push(f);
+            let few = [a, b].iter().any(|&v| self.around[v as usize].len() <= 4);
+            if few || self.neighbours(c).contains(&d) {
+                continue;
+            }
+            let new = [[a, d, c], [d, b, c]];
+            let normals = new.map(|face| self.normal(&face));
+            let sliver = new.iter().any(|face| self.least_sine(face) < LEAST_SINE);
+            let outward = |n: Vec3, face: &[u32; 3]| {
+                face.iter().all(|&v| {
+                    let g = self.scene.gradient(self.at(v), 1e-3 * self.target);
+                    dot(n, g) > 0.0
+                })
+            };
+            if sliver || !(outward(normals[0], &new[0]) && outward(normals[1], &new[1])) {
+                continue;
+            }
+            self.replace(faces, new, edge, [c, d]);
         }
+    }
+
+    /// The sine of a face's least angle.
+    fn least_sine(&self, face: &[u32; 3]) -> f64 {
+        let [a, b, c] = face.map(|v| self.at(v));
+        let mut sides = [norm(sub(b, a)), norm(sub(c, b)), norm(sub(a, c))];
+        sides.sort_unstable_by(f64::total_cmp);
+        norm(double_area(&self.vertices, face)) / (sides[1] * sides[2])
+    }
+
+    /// Puts the two faces across the other diagonal c-d in the place of those at the edge a-b.
+    fn replace(
+        &mut self,
+        [f, g]: [u32; 2],
+        new: [[u32; 3]; 2],
+        [a, b]: [u32; 2],
+        [c, d]: [u32; 2],
+    ) {
+        (self.faces[f as usize], self.faces[g as usize]) = (new[0], new[1]);
+        self.around[a as usize].retain(|&x| x != g);
+        self.around[b as usize].retain(|&x| x != f);
+        self.around[c as usize].push(g);
+        self.around[d as usize].push(f);
     }
 
     /// Whether the second edge is the longer one by a margin, so that flips cannot go to and fro.
@@ -251,14 +333,18 @@ impl Mesh<'_> {
             }
             let here = self.at(v);
             let near = self.neighbours(v);
-            let sum = near.iter().fold([0.0; 3], |s, &u| along(s, self.at(u), 1.0));
+            let sum = near
+                .iter()
+                .fold([0.0; 3], |s, &u| along(s, self.at(u), 1.0));
             let pull = sub(sum.map(|x| x / near.len() as f64), here);
             let normal = unit(self.scene.gradient(here, 1e-3 * self.target));
             let tangential = along(pull, normal, -dot(pull, normal));
             let there = self.onto_surface(along(here, tangential, 0.7));
             let facing = |m: &Self| {
                 let faces = m.around[v as usize].iter().map(|&f| &m.faces[f as usize]);
-                faces.map(|f| dot(m.normal(f), normal)).fold(f64::INFINITY, f64::min)
+                faces
+                    .map(|f| dot(m.normal(f), normal))
+                    .fold(f64::INFINITY, f64::min)
             };
             let before = facing(self);
             self.vertices[v as usize] = there;
@@ -310,8 +396,12 @@ mod tests {
     #[test]
     fn reaches_the_number_of_faces_with_even_triangles() {
         let mut scene = Scene::default();
-        scene.limb(0.0, 0.0).cone(0, [0.0; 3], [1.0, 0.0, 0.0], 0.5, 0.3);
-        scene.limb(0.1, 0.0).cone(0, [0.0; 3], [0.0, 1.0, 0.0], 0.2, 0.1);
+        scene
+            .limb(0.0, 0.0)
+            .cone(0, [0.0; 3], [1.0, 0.0, 0.0], 0.5, 0.3);
+        scene
+            .limb(0.1, 0.0)
+            .cone(0, [0.0; 3], [0.0, 1.0, 0.0], 0.2, 0.1);
         let fine = surface(|p| scene.value(p), scene.seed(), 0.05, 5.0).unwrap();
         for n_faces in [600, 2000, 3001] {
             let mesh = remesh(fine.clone(), &scene, n_faces);
@@ -321,7 +411,11 @@ mod tests {
             let angle = check::least_angle(&mesh);
             assert!(angle > 15.0, "least angle {angle}");
             for v in &mesh.vertices {
-                assert!(scene.value(*v).abs() < 1e-3, "off the surface by {}", scene.value(*v));
+                assert!(
+                    scene.value(*v).abs() < 1e-3,
+                    "off the surface by {}",
+                    scene.value(*v)
+                );
             }
         }
     }

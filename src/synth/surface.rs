@@ -44,7 +44,8 @@ impl Hasher for NodeHasher {
 type Hashed = BuildHasherDefault<NodeHasher>;
 
 fn pack(node: Node) -> u64 {
-    node.iter().fold(0, |key, &x| (key << 20) | (x + REACH) as u64)
+    node.iter()
+        .fold(0, |key, &x| (key << 20) | (x + REACH) as u64)
 }
 
 /// The values at lattice nodes, each computed once.
@@ -79,8 +80,14 @@ fn corner(cube: Node, i: usize) -> Node {
 }
 
 /// Each path from corner 0 to corner 7 is a tetrahedron, in an order of positive volume.
-const TETRAHEDRA: [[usize; 4]; 6] =
-    [[0, 1, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 3, 2, 7], [0, 6, 4, 7], [0, 5, 1, 7]];
+const TETRAHEDRA: [[usize; 4]; 6] = [
+    [0, 1, 3, 7],
+    [0, 2, 6, 7],
+    [0, 4, 5, 7],
+    [0, 3, 2, 7],
+    [0, 6, 4, 7],
+    [0, 5, 1, 7],
+];
 
 /// The component of `value = 0` that is met first on the way from `seed` along the first axis, with cubes
 /// of side `cell`. `None` when no surface is met within `reach`.
@@ -92,9 +99,16 @@ pub(super) fn surface(
     cell: f64,
     reach: f64,
 ) -> Option<TriMesh> {
-    let mut lattice = Lattice { origin: seed, cell, value, known: HashMap::default() };
+    let mut lattice = Lattice {
+        origin: seed,
+        cell,
+        value,
+        known: HashMap::default(),
+    };
     let limit = ((reach / cell) as i32).min(REACH - 2);
-    let start = (0..limit).map(|i| [i, 0, 0]).find(|&c| crossed(&lattice.corners(c), 0xff))?;
+    let start = (0..limit)
+        .map(|i| [i, 0, 0])
+        .find(|&c| crossed(&lattice.corners(c), 0xff))?;
 
     let mut mesh = TriMesh::default();
     let mut crossing: HashMap<u64, u32, Hashed> = HashMap::default();
@@ -104,7 +118,9 @@ pub(super) fn surface(
     while let Some(cube) = queue.pop_front() {
         let values = lattice.corners(cube);
         for (k, side) in [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)] {
-            let mask = (0..8).filter(|i| i >> k & 1 == side).fold(0, |m, i| m | 1 << i);
+            let mask = (0..8)
+                .filter(|i| i >> k & 1 == side)
+                .fold(0, |m, i| m | 1 << i);
             let mut next = cube;
             next[k] += 2 * side - 1;
             if crossed(&values, mask) && next[k].abs() < limit && seen.insert(pack(next)) {
@@ -118,7 +134,8 @@ pub(super) fn surface(
             *crossing.entry(key).or_insert_with(|| {
                 let t = (values[a] / (values[a] - values[b])).clamp(MARGIN, 1.0 - MARGIN);
                 let (p, q) = (corner(cube, a), corner(cube, b));
-                mesh.vertices.push(mix(lattice.position(p), lattice.position(q), t));
+                mesh.vertices
+                    .push(mix(lattice.position(p), lattice.position(q), t));
                 (mesh.vertices.len() - 1) as u32
             })
         };
@@ -141,7 +158,10 @@ pub(super) fn surface(
 
 /// Whether the corners in `mask` lie on both sides.
 fn crossed(values: &[f64; 8], mask: u32) -> bool {
-    let inside = (0..8).filter(|&i| values[i] < 0.0).fold(0, |m, i| m | 1 << i) & mask;
+    let inside = (0..8)
+        .filter(|&i| values[i] < 0.0)
+        .fold(0, |m, i| m | 1 << i)
+        & mask;
     inside != 0 && inside != mask
 }
 
@@ -158,7 +178,11 @@ fn inside_first(mut t: [usize; 4], values: &[f64; 8]) -> (usize, [usize; 4]) {
     }
     if odd {
         // Swapping two on the same side keeps the sorting; with 1 or 2 inside the last two are outside.
-        if n_inside <= 2 { t.swap(2, 3) } else { t.swap(0, 1) }
+        if n_inside <= 2 {
+            t.swap(2, 3)
+        } else {
+            t.swap(0, 1)
+        }
     }
     (n_inside, t)
 }
@@ -192,9 +216,14 @@ mod tests {
         // Values without any smoothness: every case of every tetrahedron occurs.
         let noise = |p: [f64; 3]| {
             let key = p.iter().fold(1u64, |k, x| {
-                (k ^ ((x * 16.0).round() as i64 as u64)).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ k >> 31
+                (k ^ ((x * 16.0).round() as i64 as u64)).wrapping_mul(0x9e37_79b9_7f4a_7c15)
+                    ^ k >> 31
             });
-            if norm(p) > 1.0 { 1.0 } else { (key >> 40) as f64 / (1 << 24) as f64 - 0.6 }
+            if norm(p) > 1.0 {
+                1.0
+            } else {
+                (key >> 40) as f64 / (1 << 24) as f64 - 0.6
+            }
         };
         let mesh = surface(noise, [0.0; 3], 0.0625, 5.0).unwrap();
         assert!(mesh.faces.len() > 1000);

@@ -9,7 +9,13 @@ use std::collections::BTreeSet;
 const COUNT: u32 = 8;
 
 fn used(labelled: &Labelled) -> Vec<u32> {
-    labelled.labels.iter().copied().collect::<BTreeSet<_>>().into_iter().collect()
+    labelled
+        .labels
+        .iter()
+        .copied()
+        .collect::<BTreeSet<_>>()
+        .into_iter()
+        .collect()
 }
 
 #[test]
@@ -19,7 +25,11 @@ fn shapes_are_closed_connected_and_outward() {
             let (mesh, name) = (&shape.mesh, &shape.name);
             check::closed_manifold(mesh);
             assert_eq!(check::n_components(mesh), 1, "{name}");
-            assert!(check::volume(mesh) > 0.005, "{name}: volume {}", check::volume(mesh));
+            assert!(
+                check::volume(mesh) > 0.005,
+                "{name}: volume {}",
+                check::volume(mesh)
+            );
             assert_eq!(shape.labels.len(), mesh.faces.len());
             let n = mesh.faces.len();
             assert!((5_900..=6_000).contains(&n), "{name}: {n} faces");

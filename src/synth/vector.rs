@@ -32,7 +32,11 @@ pub(super) fn dot(a: Vec3, b: Vec3) -> f64 {
 }
 
 pub(super) fn cross(a: Vec3, b: Vec3) -> Vec3 {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
 }
 
 pub(super) fn norm(a: Vec3) -> f64 {
@@ -51,8 +55,13 @@ pub(super) fn sin_cos(degrees: f64) -> (f64, f64) {
     let x = (degrees - 90.0 * quarter) * (std::f64::consts::PI / 180.0);
     let y = x * x;
     // Taylor polynomials by Horner's rule; |x| <= pi/4, so degree 17 leaves less than 1e-17.
-    let sin = x * (1..=8).rev().fold(1.0, |s, k| 1.0 - s * y / f64::from(2 * k * (2 * k + 1)));
-    let cos = (1..=9).rev().fold(1.0, |s, k| 1.0 - s * y / f64::from(2 * k * (2 * k - 1)));
+    let sin = x
+        * (1..=8)
+            .rev()
+            .fold(1.0, |s, k| 1.0 - s * y / f64::from(2 * k * (2 * k + 1)));
+    let cos = (1..=9)
+        .rev()
+        .fold(1.0, |s, k| 1.0 - s * y / f64::from(2 * k * (2 * k - 1)));
     match quarter.rem_euclid(4.0) as u8 {
         0 => (sin, cos),
         1 => (cos, -sin),
@@ -77,14 +86,20 @@ pub(super) struct Frame {
 impl Frame {
     /// The axes of the world at `origin`.
     pub(super) fn at(origin: Vec3) -> Self {
-        Self { origin, axes: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] }
+        Self {
+            origin,
+            axes: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        }
     }
 
     /// The frame at `origin` whose second axis is `y`, and whose third is as near to `z` as can be.
     pub(super) fn facing(origin: Vec3, y: Vec3, z: Vec3) -> Self {
         let y = unit(y);
         let x = unit(cross(y, z));
-        Self { origin, axes: [x, y, cross(x, y)] }
+        Self {
+            origin,
+            axes: [x, y, cross(x, y)],
+        }
     }
 
     /// Turned in its own plane of axes `i` and `j`, from `i` towards `j`.
@@ -168,7 +183,10 @@ mod tests {
             let (s, c) = sin_cos(degrees);
             let x = degrees.to_radians();
             // The library's argument is rounded to one part in 2^53 of up to 26 radians.
-            assert!((s - x.sin()).abs() < 1e-14 && (c - x.cos()).abs() < 1e-14, "{degrees}");
+            assert!(
+                (s - x.sin()).abs() < 1e-14 && (c - x.cos()).abs() < 1e-14,
+                "{degrees}"
+            );
         }
         assert_eq!(sin_cos(90.0), (1.0, 0.0));
         assert_eq!(sin_cos(180.0), (0.0, -1.0));
@@ -176,7 +194,8 @@ mod tests {
 
     #[test]
     fn frames_stay_right_handed() {
-        let f = Frame::facing([1.0, 2.0, 3.0], [0.3, 1.0, -0.2], [0.0, 0.5, 1.0]).turned(0, 2, 35.0);
+        let f =
+            Frame::facing([1.0, 2.0, 3.0], [0.3, 1.0, -0.2], [0.0, 0.5, 1.0]).turned(0, 2, 35.0);
         let [x, y, z] = f.axes;
         assert!((dot(cross(x, y), z) - 1.0).abs() < 1e-12);
         let p = [0.3, -0.7, 1.1];

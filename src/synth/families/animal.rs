@@ -26,7 +26,10 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let front = [0.0, leg + slope, length / 2.0];
     let belly = along(scale(add(rear, front), 0.5), UP, -dice.between(0.0, 0.05));
     let waist = (chest + hips) / 2.0 * dice.between(0.85, 1.1);
-    scene.limb(0.0, 0.12).cone(BODY, rear, belly, hips, waist).cone(BODY, belly, front, waist, chest);
+    scene
+        .limb(0.0, 0.12)
+        .cone(BODY, rear, belly, hips, waist)
+        .cone(BODY, belly, front, waist, chest);
 
     // Legs: the pairs stride against each other.
     let thick = dice.between(0.8, 1.25);
@@ -48,9 +51,18 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let nape = along(along(front, FRONT, 0.35 * chest), UP, 0.35 * chest);
     let top = along(nape, rise, reach);
     let skull = dice.between(0.1, 0.14);
-    let neck = [skull * dice.between(0.72, 0.85), chest * dice.between(0.5, 0.66)];
-    scene.limb(0.07, 0.0).cone(NECK, nape, top, neck[1], neck[0]);
-    let gaze = turn(turn(FRONT, [1.0, 0.0, 0.0], 1.6 * yaw), UP, dice.between(-35.0, 8.0));
+    let neck = [
+        skull * dice.between(0.72, 0.85),
+        chest * dice.between(0.5, 0.66),
+    ];
+    scene
+        .limb(0.07, 0.0)
+        .cone(NECK, nape, top, neck[1], neck[0]);
+    let gaze = turn(
+        turn(FRONT, [1.0, 0.0, 0.0], 1.6 * yaw),
+        UP,
+        dice.between(-35.0, 8.0),
+    );
     let muzzle = dice.between(0.12, 0.26);
     let centre = along(top, gaze, 0.35 * skull);
     let nose = along(centre, gaze, muzzle);
@@ -60,19 +72,31 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     scene
         .limb(0.03, 0.05)
         .ellipsoid(HEAD, frame, [skull, 1.15 * skull, 1.05 * skull])
-        .cone(HEAD, along(centre, crown, -0.15 * skull), along(nose, crown, -0.3 * skull), 0.8 * skull, snout);
+        .cone(
+            HEAD,
+            along(centre, crown, -0.15 * skull),
+            along(nose, crown, -0.3 * skull),
+            0.8 * skull,
+            snout,
+        );
 
     // Ears: from small and round to long, upright or hanging.
-    let ear = dice.between(0.07, 0.19);
-    let lean = dice.between(-15.0, 80.0);
+    let ear = dice.between(0.08, 0.19);
+    let lean = dice.between(12.0, 85.0);
     for side in [-1.0, 1.0] {
         let out = scale(frame.axes[0], side);
         let base = along(along(centre, crown, 0.66 * skull), out, 0.6 * skull);
         let base = along(base, gaze, -0.35 * skull);
         let direction = turn(crown, out, lean);
-        let flat = Frame::facing(along(base, direction, 0.8 * ear), direction, cross(direction, gaze));
+        let flat = Frame::facing(
+            along(base, direction, 0.8 * ear),
+            direction,
+            cross(direction, gaze),
+        );
         // The third axis of the frame is across the ear, the first its thickness.
-        scene.limb(0.02, 0.0).ellipsoid(EAR, flat, [0.032, ear, dice.between(0.05, 0.075)]);
+        scene
+            .limb(0.02, 0.0)
+            .ellipsoid(EAR, flat, [0.038, ear, dice.between(0.055, 0.08)]);
     }
 
     // Tail: up, down or trailing.
@@ -90,7 +114,9 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         points.push(at);
     }
     let root = dice.between(0.042, 0.06);
-    scene.limb(0.05, 0.01).tube(TAIL, &points, root, dice.between(0.03, 0.045));
+    scene
+        .limb(0.05, 0.01)
+        .tube(TAIL, &points, root, dice.between(0.03, 0.045));
     scene
 }
 
@@ -103,7 +129,11 @@ fn legs(scene: &mut Scene, hip: Vec3, leg: f64, swing: f64, bend: f64, thick: f6
     let long = hip[1];
     let knee = along(hip, upper, 0.5 * long);
     let ankle = along(knee, lower, 0.42 * long);
-    let toe = along(along(ankle, down, 0.03), unit([0.0, -0.1, 1.0]), 0.07 + 0.02 * leg);
+    let toe = along(
+        along(ankle, down, 0.03),
+        unit([0.0, -0.1, 1.0]),
+        0.07 + 0.02 * leg,
+    );
     let thigh = if is_front { 0.085 } else { 0.1 } * thick;
     scene
         .limb(0.05, 0.03)

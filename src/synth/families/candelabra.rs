@@ -33,24 +33,36 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let wax = dice.between(0.034, 0.044);
     let long = dice.between(0.14, 0.3);
     let ring = dice.chance(0.5);
-    let reach = dice.between(0.3, 0.42);
-    let inner = dice.between(0.55, 0.7);
+    let reach = dice.between(0.3, 0.4);
+    let inner = dice.between(0.2, 0.26);
+    let spacing = dice.between(0.17, 0.21);
+    let step = dice.between(0.0, 0.06);
     let droop = dice.between(0.1, 0.28);
     let rise = dice.between(-0.04, 0.12);
     let turned = dice.between(0.0, 360.0);
     for i in 0..n_arms {
         // In a ring around the stem, or all in one plane, pair by pair, the outer pairs lower.
-        let (angle, far, root) = if ring {
-            (360.0 * i as f64 / n_arms as f64, reach * if n_arms > 4 { 1.1 } else { 1.0 }, high)
+        let (angle, far, root, level) = if ring {
+            let far = reach * if n_arms > 4 { 1.1 } else { 1.0 };
+            (
+                turned + 360.0 * i as f64 / n_arms as f64,
+                far,
+                high,
+                high + rise,
+            )
         } else {
             let pair = (i / 2) as f64;
-            let n_pairs = (n_arms / 2) as f64;
-            let share = inner + (1.55 - inner) * (pair + 1.0) / n_pairs;
-            (180.0 * (i % 2) as f64, reach * share.min(1.0 + 0.25 * pair), high - 0.12 * pair)
+            let far = inner + spacing * pair;
+            (
+                180.0 * (i % 2) as f64,
+                far,
+                high - 0.11 * pair,
+                high + rise - step * pair,
+            )
         };
-        let out = turn([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], turned + angle);
+        let out = turn([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], angle);
         let start = [0.0, root - 0.08, 0.0];
-        let end = along([0.0, high + rise, 0.0], out, far);
+        let end = along([0.0, level, 0.0], out, far);
         let points = bezier(
             [
                 start,
@@ -60,15 +72,23 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
             ],
             10,
         );
-        let limb = scene.limb(0.025, 0.01);
+        let limb = scene.limb(0.025, 0.0);
         limb.tube(ARM, &points, 0.036, 0.03);
         candle(scene.limb(0.015, 0.01), end, cup, wax, long);
     }
     if n_candles % 2 == 1 {
-        candle(scene.limb(0.015, 0.01), [0.0, high + rise.max(0.0) + 0.02, 0.0], cup, wax, long);
+        candle(
+            scene.limb(0.015, 0.01),
+            [0.0, high + rise.max(0.0) + 0.02, 0.0],
+            cup,
+            wax,
+            long,
+        );
     } else {
         let finial = Frame::at([0.0, high + 0.02, 0.0]);
-        scene.limb(0.02, 0.0).ellipsoid(STEM, finial, [0.05, 0.07, 0.05]);
+        scene
+            .limb(0.02, 0.0)
+            .ellipsoid(STEM, finial, [0.05, 0.07, 0.05]);
     }
     scene
 }
@@ -79,7 +99,11 @@ fn base(scene: &mut Scene, dice: &mut Dice, rod: f64) {
     match dice.pick(3) {
         0 => {
             limb.disc(BASE, Frame::at([0.0, 0.0, 0.0]), wide, 0.04, 0.03);
-            limb.ellipsoid(BASE, Frame::at([0.0, 0.03, 0.0]), [0.6 * wide, 0.08, 0.6 * wide]);
+            limb.ellipsoid(
+                BASE,
+                Frame::at([0.0, 0.03, 0.0]),
+                [0.6 * wide, 0.08, 0.6 * wide],
+            );
         }
         1 => {
             let square = [0.85 * wide, 0.04, 0.85 * wide];
@@ -91,10 +115,19 @@ fn base(scene: &mut Scene, dice: &mut Dice, rod: f64) {
             let hub = [0.0, 0.1, 0.0];
             limb.cone(BASE, hub, along(hub, UP, 0.03), 1.9 * rod, 1.6 * rod);
             for i in 0..3 {
-                let out = turn([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 30.0 + 120.0 * f64::from(i));
+                let out = turn(
+                    [1.0, 0.0, 0.0],
+                    [0.0, 0.0, 1.0],
+                    30.0 + 120.0 * f64::from(i),
+                );
                 let end = along([0.0, 0.0, 0.0], out, wide);
                 let points = bezier(
-                    [hub, along(add(hub, [0.0, 0.08, 0.0]), out, 0.5 * wide), along(end, UP, 0.06), end],
+                    [
+                        hub,
+                        along(add(hub, [0.0, 0.08, 0.0]), out, 0.5 * wide),
+                        along(end, UP, 0.06),
+                        end,
+                    ],
                     6,
                 );
                 limb.tube(BASE, &points, 0.05, 0.042);

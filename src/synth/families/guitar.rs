@@ -15,13 +15,28 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let length = dice.between(0.42, 0.56);
     let kind = dice.pick(4);
     let (points, thick, blend, acoustic) = match kind {
-        0 => (classical(dice, length), dice.between(0.06, 0.085), 0.01, true),
-        1 => (horned(dice, length), dice.between(0.042, 0.055), 0.01, false),
+        0 => (
+            classical(dice, length),
+            dice.between(0.06, 0.085),
+            0.01,
+            true,
+        ),
+        1 => (
+            horned(dice, length),
+            dice.between(0.042, 0.055),
+            0.01,
+            false,
+        ),
         2 => (arrow(dice, length), dice.between(0.042, 0.05), 0.01, false),
         _ => (pear(dice, length), dice.between(0.06, 0.09), 0.02, true),
     };
     let outline = closed_curve(&points, 5);
-    let body = Solid::Plate { frame, outline, half: thick - 0.03, round: 0.03 };
+    let body = Solid::Plate {
+        frame,
+        outline,
+        half: thick - 0.03,
+        round: 0.03,
+    };
     scene.limb(0.0, 0.0).solid(BODY, body);
 
     // The neck runs up from the body, raised to the level of its top.
@@ -44,7 +59,9 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         dish.block(BODY, bridge, [dice.between(0.07, 0.1), 0.028, 0.03], 0.02);
     } else {
         let bridge = Frame::at([0.0, -0.2 * length, thick]);
-        scene.limb(0.01, 0.0).block(BODY, bridge, [0.06, 0.035, 0.028], 0.02);
+        scene
+            .limb(0.01, 0.0)
+            .block(BODY, bridge, [0.06, 0.035, 0.028], 0.02);
     }
     scene
 }
@@ -78,20 +95,24 @@ fn head(scene: &mut Scene, dice: &mut Dice, at: [f64; 3], half_width: f64) {
             [-0.85 * wide, 0.28 * long],
         ]
     };
-    let plate = Solid::Plate { frame, outline, half: 0.004, round: 0.028 };
+    let plate = Solid::Plate {
+        frame,
+        outline,
+        half: 0.004,
+        round: 0.028,
+    };
     let limb = scene.limb(0.01, 0.01);
     limb.solid(HEAD, plate);
     // Pegs, on one side or both.
-    let n = 2 + dice.pick(2);
-    for i in 0..n {
-        let y = long * (0.42 + 0.5 * f64::from(i as u8) / f64::from(n as u8 - 1));
-        let reach = wide + 0.085;
+    for i in 0..2 {
+        let y = long * (0.42 + 0.5 * f64::from(i));
+        let reach = wide + dice.between(0.05, 0.06);
         for s in [-1.0, 1.0] {
             if one_sided && s != side {
                 continue;
             }
             let (from, to) = (frame.world([0.0, y, 0.0]), frame.world([s * reach, y, 0.0]));
-            limb.cone(HEAD, from, to, 0.025, 0.03);
+            limb.cone(HEAD, from, to, 0.025, 0.027);
         }
     }
 }
@@ -100,7 +121,11 @@ fn head(scene: &mut Scene, dice: &mut Dice, at: [f64; 3], half_width: f64) {
 fn mirrored(length: f64, right: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let h = length / 2.0;
     let mut points: Vec<[f64; 2]> = right.iter().map(|[x, y]| [x * h, y * h]).collect();
-    let left = right.iter().rev().filter(|p| p[0] != 0.0).map(|[x, y]| [-x * h, y * h]);
+    let left = right
+        .iter()
+        .rev()
+        .filter(|p| p[0] != 0.0)
+        .map(|[x, y]| [-x * h, y * h]);
     points.extend(left);
     points
 }
@@ -124,20 +149,32 @@ fn classical(dice: &mut Dice, length: f64) -> Vec<[f64; 2]> {
 }
 
 fn horned(dice: &mut Dice, length: f64) -> Vec<[f64; 2]> {
-    let lower = dice.between(0.62, 0.76);
-    let waist = lower * dice.between(0.66, 0.8);
+    let lower = dice.between(0.76, 0.92);
+    let waist = lower * dice.between(0.62, 0.75);
     let h = length / 2.0;
     // One horn, or two of unequal length.
-    let tips = [dice.between(1.15, 1.5), if dice.chance(0.6) { dice.between(1.0, 1.25) } else { 0.55 }];
+    let tips = [
+        dice.between(1.15, 1.5),
+        if dice.chance(0.6) {
+            dice.between(1.0, 1.25)
+        } else {
+            0.55
+        },
+    ];
     let half = |tip: f64| {
-        let mut points = vec![[0.7 * lower, -0.9], [lower, -0.5], [0.93 * lower, -0.15], [waist, 0.2]];
+        let mut points = vec![
+            [0.7 * lower, -0.9],
+            [lower, -0.5],
+            [0.93 * lower, -0.15],
+            [waist, 0.2],
+        ];
         if tip > 0.9 {
             points.extend([
-                [0.98 * waist, 0.6],
-                [0.95 * waist, tip - 0.1],
-                [0.78 * waist, tip],
-                [0.55 * waist, 0.85],
-                [0.3, 0.68],
+                [1.12 * waist, 0.6],
+                [1.16 * waist, tip - 0.12],
+                [0.98 * waist, tip],
+                [0.72 * waist, 0.82],
+                [0.3, 0.62],
             ]);
         } else {
             points.extend([[0.96 * waist, 0.5], [0.6 * waist, 0.68]]);

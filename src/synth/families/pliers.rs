@@ -15,9 +15,13 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let flat = dice.between(0.05, 0.065);
     // The second axis of a disc is its axis; pliers lie in the plane of x and y.
     let axle = Frame::at([0.0; 3]).turned(1, 2, 90.0);
-    scene.limb(0.0, 0.0).disc(JOINT, axle, joint, 1.25 * flat, 0.03);
+    scene
+        .limb(0.0, 0.0)
+        .disc(JOINT, axle, joint, 1.25 * flat, 0.03);
     if dice.chance(0.6) {
-        scene.limb(0.02, 0.0).disc(JOINT, axle, 0.5 * joint, 1.25 * flat + 0.03, 0.02);
+        scene
+            .limb(0.02, 0.0)
+            .disc(JOINT, axle, 0.5 * joint, 1.25 * flat + 0.03, 0.02);
     }
 
     let open = dice.between(5.0, 24.0);
@@ -46,14 +50,24 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
                     [-side * (0.03 + 1.2 * width), 0.8 * jaw],
                     [-side * 0.035, 0.8 * jaw],
                 ];
-                let solid = Solid::Plate { frame: lever, outline, half: flat - 0.03, round: 0.03 };
+                let solid = Solid::Plate {
+                    frame: lever,
+                    outline,
+                    half: flat - 0.03,
+                    round: 0.03,
+                };
                 limb.solid(JAW, solid);
             }
             _ => {
                 // Curved, meeting at the tips.
                 let out = dice.between(0.13, 0.17);
                 let points = bezier(
-                    [at(0.04, 0.05), at(out, 0.2 * jaw), at(out, 0.75 * jaw), at(0.05, 0.9 * jaw)],
+                    [
+                        at(0.04, 0.05),
+                        at(out, 0.2 * jaw),
+                        at(out, 0.75 * jaw),
+                        at(0.05, 0.9 * jaw),
+                    ],
                     8,
                 );
                 limb.tube(JAW, &points, flat, 0.036);
@@ -66,7 +80,9 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
             at(-0.07 - bow - flare, -handle),
         ];
         let points = bezier(ends, 10);
-        scene.limb(0.03, 0.01).tube(HANDLE, &points, 0.8 * grip, grip);
+        scene
+            .limb(0.03, 0.0)
+            .tube(HANDLE, &points, 0.8 * grip, grip);
     }
     scene
 }
