@@ -12,9 +12,10 @@ mod discover;
 mod features;
 mod joint;
 mod model;
+pub mod score;
 
 pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
-pub mod score;
+

@@ -48,10 +48,10 @@ impl Library {
             let epoch = commit.plan.learnt.model.epoch;
             let added = EventKind::ShapeAdded {
                 shape: commit.shape.name.clone(),
-                version: 1,
+                version: commit.placed.version,
                 area_shares: commit.labels.summary.area_shares.clone(),
             };
-            commit.labels.row.version = 1;
+            commit.labels.row.version = commit.placed.version;
             commit.labels.row.sequence = event(tx, collection, &added)?;
             commit.labels.row.cause = "added".into();
             commit.labels.row.sources_json = to_json(&commit.sources);

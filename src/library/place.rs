@@ -110,12 +110,13 @@ impl Library {
             n_polygons: view.face_map.len() as u64,
             area: description.area,
             report_json: super::rows::report_to_json(&description.report).to_string(),
+            version: replaced.map_or(0, |old| old.version),
             signature: description.signature.clone(),
             stored_bytes: object.length + self.object_length(&accepted.item.original_digest)?,
         };
         let placed = Placed {
             outcome: if replaced.is_some() { Outcome::Replaced } else { Outcome::Added },
-            version: 1,
+            version: shape.version + 1,
             sequence: 0,
             n_maps: maps.len() as u32,
             n_relabelled,

@@ -32,63 +32,16 @@ pub(super) fn damaged(place: &str, message: &str) -> LibraryError {
     StoreError::Damaged { path: place.to_string(), message: message.to_string() }.into()
 }
 
-const REPORT: [&str; 12] = [
-    "n_polygons",
-    "n_triangles",
-    "n_vertices",
-    "n_welded_vertices",
-    "n_isolated_vertices",
-    "n_degenerate_triangles",
-    "n_duplicate_triangles",
-    "n_nonmanifold_edges",
-    "n_boundary_edges",
-    "n_components",
-    "n_proxy_faces",
-    "n_proxy_vertices",
-];
-
 /// A clean report as JSON.
-pub fn report_to_json(r: &CleanReport) -> Value {
-    let counts = [
-        r.n_polygons,
-        r.n_triangles,
-        r.n_vertices,
-        r.n_welded_vertices,
-        r.n_isolated_vertices,
-        r.n_degenerate_triangles,
-        r.n_duplicate_triangles,
-        r.n_nonmanifold_edges,
-        r.n_boundary_edges,
-        r.n_components,
-        r.n_proxy_faces,
-        r.n_proxy_vertices,
-    ];
-    let mut map: serde_json::Map<String, Value> =
-        REPORT.iter().zip(counts).map(|(k, v)| (k.to_string(), json!(v))).collect();
-    map.insert("n_bridges".into(), json!(r.n_bridges));
-    Value::Object(map)
+pub fn report_to_json(report: &CleanReport) -> Value {
+    Value::Object(report.counts().into_iter().map(|(name, n)| (name.into(), json!(n))).collect())
 }
 
 pub(super) fn report_from_json(text: &str, place: &str) -> Result<CleanReport> {
     let value: Value = from_json(text, place)?;
-    let count = |name: &str| -> Result<usize> {
+    CleanReport::from_counts(|name| {
         let n = value.get(name).and_then(Value::as_u64);
         n.map(|n| n as usize).ok_or_else(|| damaged(place, &format!("no count {name:?}")))
-    };
-    Ok(CleanReport {
-        n_polygons: count("n_polygons")?,
-        n_triangles: count("n_triangles")?,
-        n_vertices: count("n_vertices")?,
-        n_welded_vertices: count("n_welded_vertices")?,
-        n_isolated_vertices: count("n_isolated_vertices")?,
-        n_degenerate_triangles: count("n_degenerate_triangles")?,
-        n_duplicate_triangles: count("n_duplicate_triangles")?,
-        n_nonmanifold_edges: count("n_nonmanifold_edges")?,
-        n_boundary_edges: count("n_boundary_edges")?,
-        n_components: count("n_components")?,
-        n_proxy_faces: count("n_proxy_faces")?,
-        n_proxy_vertices: count("n_proxy_vertices")?,
-        n_bridges: count("n_bridges")?,
     })
 }
 

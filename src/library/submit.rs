@@ -352,7 +352,7 @@ fn failure(error: &LibraryError) -> Failure {
 fn refusal(error: &DescribeError) -> Failure {
     let (code, reason) = match error {
         DescribeError::Parse(_) => ("INVALID_ARGUMENT", "PARSE"),
-        DescribeError::Clean(CleanError::NoArea { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),
+        DescribeError::Clean(CleanError::AllDegenerate { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),
         DescribeError::Clean(_) => ("INVALID_ARGUMENT", "MESH"),
         DescribeError::Laplacian(_) => ("INVALID_ARGUMENT", "LAPLACIAN"),
         DescribeError::Spectrum(_) => ("INTERNAL", "SPECTRUM"),

@@ -14,6 +14,7 @@ mod orient;
 mod parse;
 mod proxy;
 mod refine;
+mod report;
 mod vector;
 #[cfg(test)]
 pub(crate) mod zoo;

@@ -94,9 +94,9 @@ pub enum LaplacianError {
         /// The weight.
         weight: f64,
     },
-    /// A bridge names a vertex that does not exist, or joins a vertex to itself.
+    /// A bridge names a vertex that does not exist.
     #[error(
-        "bridge {bridge} joins vertices {vertices:?}, but needs two different ones of {n_vertices}"
+        "bridge {bridge} joins vertices {vertices:?}, but there are only {n_vertices}"
     )]
     Bridge {
         /// Which bridge.
@@ -144,7 +144,9 @@ pub fn laplacian(
         let total: f64 = merged.iter().map(|e| e.weight.abs()).sum();
         total / merged.len().max(1) as f64
     };
-    edges.extend(bridges.iter().map(|b| Edge {
+    // Components that share a vertex are joined there already.
+    let apart = bridges.iter().filter(|b| b.vertices[0] != b.vertices[1]);
+    edges.extend(apart.map(|b| Edge {
         vertices: [
             b.vertices[0].min(b.vertices[1]),
             b.vertices[0].max(b.vertices[1]),
@@ -295,7 +297,7 @@ fn check(mesh: &TriMesh, bridges: &[Bridge]) -> Result<(), LaplacianError> {
     }
     for (bridge, b) in bridges.iter().enumerate() {
         let [p, q] = b.vertices;
-        if p == q || p as usize >= n_vertices || q as usize >= n_vertices {
+        if p as usize >= n_vertices || q as usize >= n_vertices {
             return Err(LaplacianError::Bridge {
                 bridge,
                 vertices: b.vertices,

@@ -5,7 +5,7 @@ use crate::descriptors;
 use crate::mesh::{self, CleanError, DualGraph, Format, ParseError, TriMesh};
 use crate::operators::{LaplacianError, laplacian};
 use crate::segmentation::patches;
-use crate::spectrum::{Spectrum, SpectrumError};
+use crate::spectrum::{self, Spectrum, SpectrumError};
 use nalgebra::DMatrix;
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
@@ -14,6 +14,8 @@ pub const ALGORITHM_VERSION: u32 = 1;
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
 pub const MAX_EIGENVECTORS: usize = 100;
+/// Eigenpairs on meshes so small that a quarter of their vertices is fewer.
+const MIN_EIGENPAIRS: usize = 4;
 /// Patches of the over-segmentation.
 const N_PATCHES: usize = 80;
 
@@ -76,7 +78,8 @@ pub fn describe(
     let patches = patches(&proxy_mesh, &dual, face.farthest_start, N_PATCHES);
     let signature = descriptors::signature(&proxy_mesh, &face, values);
 
-    let (face_map, polygon_area) = polygons_to_proxy(&parsed, &cleaned, &proxy.face_map);
+    let face_map: Vec<u32> =
+        cleaned.face_of_polygon.iter().map(|f| proxy.face_map[*f as usize]).collect();
     let mut report = cleaned.report;
     report.n_proxy_faces = proxy_mesh.faces.len();
     report.n_proxy_vertices = vertices.len();
@@ -95,7 +98,7 @@ pub fn describe(
         face_descriptors: face.data,
         patches,
         face_map,
-        polygon_area,
+        polygon_area: cleaned.polygon_area.iter().map(|a| *a as f32).collect(),
         signature,
         vertices,
     })
@@ -118,7 +121,15 @@ pub fn spectrum_of(
     if !stage("spectrum") {
         return Err(DescribeError::Cancelled("spectrum"));
     }
-    todo!()
+    let options = spectrum::Options {
+        // Stages within the solver are told as they come, but time is kept by ours.
+        stage: None,
+        ..spectrum::Options::default()
+    };
+    let n = mesh.vertices.len();
+    let k = (params.n_eigenpairs as usize).min(n / 4).max(MIN_EIGENPAIRS.min(n));
+    let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)?;
+    Ok(MeshSpectrum { spectrum, mass: operator.mass })
 }
 
 /// The first `n` columns, row-major, in single precision.

@@ -280,7 +280,9 @@ fn check_labels(
         if let Some(described) = described {
             let n_faces = described.n_faces as u64;
             lengths.push(("proxy labels", labels.proxy_labels.len() as u64, n_faces));
-            lengths.push(("proxy confidences", labels.proxy_confidence.len() as u64, n_faces));
+            let n_labels = (labels.proxy_probabilities.len() as u64).div_ceil(n_faces.max(1));
+            let expected = n_labels.max(1) * n_faces;
+            lengths.push(("proxy probabilities", labels.proxy_probabilities.len() as u64, expected));
         }
         for (what, found, expected) in lengths {
             if found != expected {

@@ -37,6 +37,11 @@ pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
 pub use health::Health;
 pub use objects::Objects;
+pub use mapped::MappedDescription;
+pub use rows::{
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow, MapRow,
+    NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId, ShapeRow,
+};
 
 use disk::{Disk, RealDisk};
 use lock::LibraryLock;
