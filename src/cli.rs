@@ -1,5 +1,6 @@
 //! What was typed becomes one command with typed flags.
 
+use crate::commands::synth::SynthArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use coseg::ipc::wire;
 use std::path::PathBuf;
@@ -92,6 +93,8 @@ pub(crate) enum Command {
     Stats,
     /// Let the daemon finish what it is at and stop
     Stop,
+    /// Make a family of labelled shapes
+    Synth(SynthArgs),
     /// Verify a library's files against its catalog, without a daemon
     Check(Check),
     /// Check or show the daemon's configuration

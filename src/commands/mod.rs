@@ -19,6 +19,7 @@ mod session;
 mod show;
 mod stats;
 mod stop;
+pub(crate) mod synth;
 mod wait;
 mod watch;
 
@@ -49,6 +50,9 @@ pub(crate) enum CommandError {
     /// Logging cannot be set up.
     #[error(transparent)]
     Telemetry(#[from] crate::telemetry::TelemetryError),
+    /// Shapes could not be made.
+    #[error(transparent)]
+    Synth(#[from] synth::SynthError),
     /// What was typed cannot be meant.
     #[error("{0}")]
     Usage(String),
@@ -80,6 +84,7 @@ impl CommandError {
             | Self::Serve(_)
             | Self::Library(_)
             | Self::Telemetry(_)
+            | Self::Synth(_)
             | Self::Failed(_)
             | Self::File { .. }
             | Self::Output(_) => exit::FAILED,
@@ -122,6 +127,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Events(args) => events::run(args, session()?),
         Command::Name(args) => name::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
+        Command::Synth(args) => synth::run(args, cli.global.json).map(|()| true).map_err(Into::into),
         Command::Stats => stats::run(session()?),
         Command::Stop => stop::run(session()?),
     }?;

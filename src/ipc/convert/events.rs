@@ -7,6 +7,7 @@ use crate::library::{Event, EventKind};
 pub fn event(collection: &str, e: &Event) -> wire::Event {
     let kind = match &e.kind {
         EventKind::CollectionCreated => Kind::CollectionCreated(wire::CollectionCreated {}),
+        EventKind::CollectionDeleted => Kind::CollectionDeleted(wire::CollectionDeleted {}),
         EventKind::ShapeAdded { shape, version, area_shares } => {
             let area_shares = area_shares
                 .iter()
