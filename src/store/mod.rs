@@ -32,6 +32,7 @@ pub mod mapped;
 pub mod objects;
 pub mod rows;
 
+pub use array_file::write_description;
 pub use catalog::{Catalog, Reader, Tx};
 pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
