@@ -9,11 +9,11 @@ mod bridges;
 mod bvh;
 mod clean;
 pub mod geodesic;
-
 mod orient;
 mod parse;
 mod proxy;
 mod refine;
+mod report;
 mod vector;
 #[cfg(test)]
 pub(crate) mod zoo;
