@@ -24,5 +24,6 @@ pub mod store;
 pub mod library;
 pub mod ipc;
 pub mod daemon;
+pub mod commands;
 
 pub use library::Library;

@@ -17,3 +17,4 @@ pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
+pub mod score;

@@ -27,6 +27,8 @@ pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, parse};
 pub use proxy::{Proxy, proxy};
 pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 
+pub mod write;
+
 /// A triangle mesh: `vertices (n, 3)`, `faces (m, 3)`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TriMesh {

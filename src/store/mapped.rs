@@ -177,3 +177,21 @@ fn populate(file: &File, mapped: &Mmap) -> Result<(), ArrayFileError> {
         Err(e) => Err(ArrayFileError::Unreadable(e)),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A plain read of such a page would end the process with SIGBUS.
+    #[test]
+    fn pages_beyond_the_end_of_a_file_are_an_error() {
+        let file = tempfile::tempfile().expect("a file");
+        file.set_len(3 * 4096).expect("grown");
+        // SAFETY: the bytes are never accessed; only `populate` looks at the pages.
+        let mapped = unsafe { Mmap::map(&file) }.expect("mapped");
+        populate(&file, &mapped).expect("all there");
+        file.set_len(4096).expect("cut");
+        let error = populate(&file, &mapped).expect_err("pages are missing");
+        assert!(matches!(error, ArrayFileError::Unreadable(_)), "{error}");
+    }
+}

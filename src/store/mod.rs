@@ -24,6 +24,8 @@ mod codec;
 mod digest;
 pub mod disk;
 mod error;
+#[cfg(test)]
+mod faulty;
 mod health;
 pub mod lock;
 pub mod mapped;

@@ -30,11 +30,16 @@ const ZSTD_LEVEL: i32 = 3;
 
 const TEMPORARY: &str = "tmp";
 
+/// The folders that hold object files, or what is to become one.
+pub(super) const FOLDERS: [&str; 3] = ["objects", "originals", TEMPORARY];
+
 /// The object files of one library.
 pub struct Objects {
     disk: Arc<dyn Disk>,
     root: PathBuf,
     health: Health,
+    /// One file is published at a time, so that nobody finds a name that may yet be taken back.
+    publishing: Mutex<()>,
     state: Mutex<State>,
 }
 
@@ -73,6 +78,7 @@ impl Objects {
             disk,
             root: root.to_path_buf(),
             health,
+            publishing: Mutex::new(()),
             state: Mutex::new(State {
                 held: HashMap::new(),
                 durable_folders: HashSet::new(),
@@ -81,7 +87,7 @@ impl Objects {
                 cache_bytes: DEFAULT_CACHE_BYTES,
             }),
         };
-        for folder in ["objects", "originals", TEMPORARY] {
+        for folder in FOLDERS {
             let path = root.join(folder);
             objects
                 .disk
@@ -125,14 +131,7 @@ impl Objects {
         if let Some(mapped) = self.cached(&row.file, row.blake3) {
             return Ok(mapped);
         }
-        let path = self.root.join(&row.file);
-        let mapped = match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
-            Ok(mapped) => mapped,
-            Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
-                return Err(StoreError::io(&path, e));
-            }
-            Err(e) => return Err(damaged(&row.file, e)),
-        };
+        let mapped = map_description(&self.root, row)?;
         let mut state = self.state();
         state
             .cache
@@ -143,33 +142,7 @@ impl Objects {
 
     /// The bytes a row names, as they were put.
     pub fn original(&self, row: &ObjectRow) -> Result<Vec<u8>, StoreError> {
-        let path = self.root.join(&row.file);
-        let stored = match self.disk.read(&path) {
-            Ok(stored) => stored,
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
-            Err(e) => return Err(StoreError::io(&path, e)),
-        };
-        if stored.len() as u64 != row.length {
-            let (found, expected) = (stored.len(), row.length);
-            let message = format!("the file has {found} bytes, but the catalog says {expected}");
-            return Err(damaged(&row.file, message));
-        }
-        let found = Digest::of(&stored);
-        if found != row.blake3 {
-            let expected = row.blake3;
-            let message = format!("the file's BLAKE3 is {found}, but the catalog says {expected}");
-            return Err(damaged(&row.file, message));
-        }
-        let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
-        let found = Digest::of(&bytes);
-        if found != row.digest {
-            let message = format!(
-                "its content's BLAKE3 is {found}, but its name is {}",
-                row.digest
-            );
-            return Err(damaged(&row.file, message));
-        }
-        Ok(bytes)
+        read_original(&*self.disk, &self.root, row)
     }
 
     /// Bounds the bytes that stay mapped between uses; 0 keeps nothing mapped.
@@ -199,7 +172,7 @@ impl Objects {
             .held
             .retain(|_, since| since.elapsed() < min_age);
         let mut swept = Vec::new();
-        for folder in ["objects", "originals", TEMPORARY] {
+        for folder in FOLDERS {
             let path = self.root.join(folder);
             for entry in self
                 .disk
@@ -236,6 +209,7 @@ impl Objects {
         self.health.writable()?;
         let hex = digest.to_string();
         let folder = format!("{}/{}", kind.folder(), &hex[..2]);
+        let _publishing = self.publishing.lock().unwrap_or_else(PoisonError::into_inner);
         self.make_folder(kind.folder(), &folder)?;
 
         let blake3 = Digest::of(bytes);
@@ -246,13 +220,9 @@ impl Objects {
             self.hold([file.clone()]);
             let path = self.root.join(&file);
             match self.disk.read(&path) {
+                // Durable: it was synced before it got this name, and the name was there when
+                // `make_folder` synced the folder, or was published since.
                 Ok(stored) if same(&stored) => {
-                    // The file was synced before it got this name, but an earlier process may have
-                    // ended before the name was durable.
-                    let folder = self.root.join(&folder);
-                    self.disk
-                        .sync_dir(&folder)
-                        .map_err(|e| self.health.stop(format!("fsync {folder:?}: {e}")))?;
                     let (length, blake3) = (stored.len() as u64, Digest::of(&stored));
                     return Ok(ObjectRow {
                         kind,
@@ -282,27 +252,27 @@ impl Objects {
         ))
     }
 
-    /// Makes the folder of a two-digit prefix, its name durable.
+    /// Makes the folder of a two-digit prefix. Once per process both its own name and the names in
+    /// it are synced: an earlier process may have ended between a rename and its sync.
     fn make_folder(&self, parent: &str, folder: &str) -> Result<(), StoreError> {
         if self.state().durable_folders.contains(folder) {
             return Ok(());
         }
         let path = self.root.join(folder);
-        let created = self
-            .disk
-            .create_dir(&path)
-            .map_err(|e| StoreError::io(&path, e))?;
+        let created = self.disk.create_dir(&path).map_err(|e| StoreError::io(&path, e))?;
         let parent = self.root.join(parent);
-        if let Err(e) = self.disk.sync_dir(&parent) {
+        let synced = self.disk.sync_dir(&parent).and_then(|()| match created {
+            true => Ok(()),
+            false => self.disk.sync_dir(&path),
+        });
+        if let Err(e) = synced {
             // Once the folder is gone again, the next attempt starts from the beginning; a folder
             // that was there before cannot be taken back.
-            return Err(
-                if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
-                    StoreError::io(&parent, e)
-                } else {
-                    self.health.stop(format!("fsync {}: {e}", parent.display()))
-                },
-            );
+            return Err(if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
+                StoreError::io(&parent, e)
+            } else {
+                self.health.stop(format!("fsync {}: {e}", path.display()))
+            });
         }
         self.state().durable_folders.insert(folder.to_string());
         Ok(())
@@ -398,6 +368,50 @@ impl State {
     }
 }
 
+/// Maps the array file of a row; a file that is missing or wrong is damage.
+pub(super) fn map_description(
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<MappedDescription, StoreError> {
+    let path = root.join(&row.file);
+    match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
+        Ok(mapped) => Ok(mapped),
+        Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
+            Err(StoreError::io(&path, e))
+        }
+        Err(e) => Err(damaged(&row.file, e)),
+    }
+}
+
+/// Reads the original of a row; a file that is missing or wrong is damage.
+pub(super) fn read_original(
+    disk: &dyn Disk,
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<Vec<u8>, StoreError> {
+    let path = root.join(&row.file);
+    let stored = match disk.read(&path) {
+        Ok(stored) => stored,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
+        Err(e) => return Err(StoreError::io(&path, e)),
+    };
+    let (found, expected) = (stored.len() as u64, row.length);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Length { found, expected }));
+    }
+    let (found, expected) = (Digest::of(&stored), row.blake3);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Digest { found, expected }));
+    }
+    let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
+    let found = Digest::of(&bytes);
+    if found != row.digest {
+        let message = format!("its content's BLAKE3 is {found}, but its name is {}", row.digest);
+        return Err(damaged(&row.file, message));
+    }
+    Ok(bytes)
+}
+
 /// The name of a file below the library's folder, as the catalog has it.
 pub(super) fn relative(root: &Path, path: &Path) -> String {
     path.strip_prefix(root)
@@ -412,3 +426,6 @@ fn damaged(file: &str, message: impl ToString) -> StoreError {
         message: message.to_string(),
     }
 }
+
+#[cfg(test)]
+mod tests;

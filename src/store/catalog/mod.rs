@@ -52,12 +52,22 @@ impl Catalog {
     /// Opens the catalog at `path`, which is created if it is missing. The caller holds the
     /// library's lock.
     pub fn open(path: &Path, health: Health) -> Result<Self, StoreError> {
-        let mut connection = Connection::open(path)?;
+        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
+            | OpenFlags::SQLITE_OPEN_CREATE
+            | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let mut connection = Connection::open_with_flags(path, flags)?;
         schema::register_row_sum(&connection)?;
         connection.busy_timeout(BUSY_TIMEOUT)?;
         connection.pragma_update(None, "foreign_keys", true)?;
         schema::prepare(&mut connection, &path.display().to_string())?;
-        connection.pragma_update(None, "journal_mode", "WAL")?;
+        let mode: String =
+            connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
+        if mode != "wal" {
+            return Err(StoreError::Damaged {
+                path: path.display().to_string(),
+                message: format!("its file system allows journal mode {mode:?} only, not \"wal\""),
+            });
+        }
         connection.pragma_update(None, "synchronous", "FULL")?;
         // With neither spills nor automatic checkpoints, all syncs happen in COMMIT and in
         // `checkpoint`, where their failures are seen.
@@ -175,4 +185,83 @@ pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
 /// The catalog's path in a library folder.
 pub(super) fn path_in(library: &Path) -> PathBuf {
     library.join(CATALOG_FILE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::rows::{CollectionId, NewCollection};
+
+    fn opened() -> (tempfile::TempDir, Catalog, CollectionId) {
+        let dir = tempfile::tempdir().expect("a folder");
+        let catalog = Catalog::open(&path_in(dir.path()), Health::default()).expect("opens");
+        let new = NewCollection { name: "a".into(), ..NewCollection::default() };
+        let id = catalog.write(|tx| tx.insert_collection(&new)).expect("inserted");
+        (dir, catalog, id)
+    }
+
+    fn state(catalog: &Catalog, id: CollectionId) -> Vec<u8> {
+        let row = catalog.read(|r| r.collection_by_id(id)).expect("readable");
+        row.expect("there").state
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_that_passes() {
+        let (_dir, catalog, id) = opened();
+        let limit = |pages: u32| {
+            let writer = catalog.writer();
+            let set = |row: &rusqlite::Row<'_>| row.get::<_, u32>(0);
+            writer
+                .connection
+                .pragma_update_and_check(None, "max_page_count", pages, set)
+                .expect("set");
+        };
+        limit(1);
+        let big = vec![1; 1 << 20];
+        let full = catalog.write(|tx| tx.set_state(id, &big));
+        assert!(matches!(full, Err(StoreError::NoSpace { .. })), "{full:?}");
+        assert_eq!(state(&catalog, id), b"");
+        limit(1 << 20);
+        catalog.write(|tx| tx.set_state(id, &big)).expect("there is space again");
+        assert_eq!(state(&catalog, id), big);
+    }
+
+    #[test]
+    fn a_failed_sync_ends_writing_and_not_reading() {
+        let (_dir, catalog, id) = opened();
+        let error = ffi::Error {
+            code: rusqlite::ErrorCode::SystemIoFailure,
+            extended_code: ffi::SQLITE_IOERR_FSYNC,
+        };
+        let failed = catalog.failed(rusqlite::Error::SqliteFailure(error, None));
+        assert!(matches!(failed, StoreError::ReadOnly { .. }), "{failed}");
+        let refused = catalog.write(|tx| tx.set_state(id, b"x"));
+        assert!(matches!(refused, Err(StoreError::ReadOnly { .. })), "{refused:?}");
+        assert_eq!(state(&catalog, id), b"");
+    }
+
+    #[test]
+    fn the_log_stays_bounded_even_beside_a_reader() {
+        let (_dir, catalog, id) = opened();
+        let log = catalog.path.with_file_name("catalog.db-wal");
+        let write = || {
+            for i in 0..40_u8 {
+                catalog.write(|tx| tx.set_state(id, &vec![i; 1 << 18])).expect("written");
+            }
+        };
+        let length = || std::fs::metadata(&log).expect("there").len();
+        write();
+        assert!(length() <= CHECKPOINT_BYTES + (1 << 19), "{}", length());
+        // Beside a reader that keeps the log from being emptied, commits go on.
+        let seen = catalog.read(|r| {
+            let before = r.collection_by_id(id)?.expect("there").state;
+            write();
+            assert_eq!(r.collection_by_id(id)?.expect("there").state, before);
+            Ok::<_, StoreError>(before)
+        });
+        assert_eq!(seen.expect("readable"), vec![39; 1 << 18]);
+        write();
+        write();
+        assert!(length() <= 16 << 20, "{}", length());
+    }
 }

@@ -86,11 +86,11 @@ pub(super) fn row_key(table: &Table, row: &Row<'_>) -> String {
 }
 
 impl<'c> Reader<'c> {
-    pub(super) fn new(connection: &'c Connection) -> Self {
+    pub(in crate::store) fn new(connection: &'c Connection) -> Self {
         Self { connection }
     }
 
-    pub(super) fn connection(&self) -> &'c Connection {
+    pub(in crate::store) fn connection(&self) -> &'c Connection {
         self.connection
     }
 
