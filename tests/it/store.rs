@@ -4,6 +4,8 @@ mod array_files;
 mod catalog;
 mod crash;
 mod damage;
+mod jobs;
+mod readers;
 
 use coseg::mesh::CleanReport;
 use coseg::pipeline::Description;
@@ -50,6 +52,13 @@ fn description(n: usize, seed: u32) -> Description {
         polygon_area: values(n_polygons),
         signature: values(11),
     }
+}
+
+/// A new library in a folder of its own.
+fn opened() -> (tempfile::TempDir, Store) {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::open(&dir.path().join("deep/library")).expect("opens");
+    (dir, store)
 }
 
 const PARAMS: &str = r#"{"operator":"tufted","working_faces":2500}"#;

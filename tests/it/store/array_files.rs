@@ -241,7 +241,8 @@ fn headers_that_lie_are_refused() {
             .expect_err("a lie")
             .to_string()
     };
-    let lies: [(&str, &dyn Fn(&mut Value)); 17] = [
+    type Lie = dyn Fn(&mut Value);
+    let lies: [(&str, &Lie); 17] = [
         ("dtype", &|h| h["mass"]["dtype"] = json!("U32")),
         ("dtype", &|h| h["eigenvalues"]["dtype"] = json!("I64")),
         ("dtype", &|h| h["faces"]["dtype"] = json!("F32")),

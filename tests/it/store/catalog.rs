@@ -1,23 +1,15 @@
-//! The catalog: every row reads back, transactions are whole, readers do not wait.
+//! The catalog: every row reads back, transactions are whole.
 
-use super::{add_shape, collection_id, description, label_version, new_collection, summary};
+use super::{
+    add_shape, collection_id, description, label_version, new_collection, opened, summary,
+};
 use coseg::store::catalog::KEPT_LABEL_VERSIONS;
 use coseg::store::rows::{
-    ItemStatus, LabelRow, MapRow, NewJobItem, ObjectKind, RequestRow, confidence_from_u8,
-    confidence_to_u8,
+    LabelRow, MapRow, NewJobItem, ObjectKind, confidence_from_u8, confidence_to_u8,
 };
 use coseg::store::{Digest, Store, StoreError};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
-use std::time::Duration;
 
 type Result<T> = std::result::Result<T, StoreError>;
-
-fn opened() -> (tempfile::TempDir, Store) {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::open(&dir.path().join("deep/library")).expect("opens");
-    (dir, store)
-}
 
 #[test]
 fn a_shape_reads_back_after_reopening() -> Result<()> {
@@ -31,7 +23,7 @@ fn a_shape_reads_back_after_reopening() -> Result<()> {
     store.catalog().read(|r| -> Result<()> {
         assert_eq!(r.library_id()?, library_id);
         let collection = r.collection("chairs")?.expect("there");
-        assert_eq!(r.collections()?, [collection.clone()]);
+        assert_eq!(r.collections()?, std::slice::from_ref(&collection));
         assert_eq!(
             r.collection_by_id(collection.id)?.as_ref(),
             Some(&collection)
@@ -416,102 +408,6 @@ fn labels_have_names_colours_and_successors() -> Result<()> {
 }
 
 #[test]
-fn jobs_are_taken_up_again_in_order() -> Result<()> {
-    let (_dir, store) = opened();
-    let original = store.objects().put_original(b"bytes")?;
-    let item = |name: &str| NewJobItem {
-        name: name.into(),
-        original_digest: original.digest,
-        format: "obj".into(),
-        replace: name == "b",
-    };
-    let (first, second) = store.catalog().write(|tx| -> Result<_> {
-        tx.insert_object(&original)?;
-        let first = tx.insert_job("x", 10, &[item("a"), item("b")])?;
-        Ok((first, tx.insert_job("y", 11, &[item("c")])?))
-    })?;
-    store
-        .catalog()
-        .write(|tx| tx.set_item(first, 0, ItemStatus::Failed, Some("{}")))?;
-    let queued = store.catalog().read(|r| r.queued_items())?;
-    let order: Vec<_> = queued
-        .iter()
-        .map(|i| (i.job, i.index, i.collection.as_str(), i.item.replace))
-        .collect();
-    assert_eq!(order, [(first, 1, "x", true), (second, 0, "y", false)]);
-    let items = store.catalog().read(|r| r.job_items(first))?;
-    assert_eq!(items[0].status, ItemStatus::Failed);
-    assert_eq!(items[0].detail_json.as_deref(), Some("{}"));
-    assert_eq!(
-        store
-            .catalog()
-            .read(|r| r.job(second))?
-            .expect("there")
-            .created_unix_secs,
-        11
-    );
-    let unknown = store
-        .catalog()
-        .write(|tx| tx.set_item(second, 5, ItemStatus::Done, None));
-    assert!(
-        matches!(unknown, Err(StoreError::Missing { .. })),
-        "{unknown:?}"
-    );
-    store
-        .catalog()
-        .write(|tx| tx.set_item(second, 0, ItemStatus::Cancelled, None))?;
-    assert_eq!(
-        store.catalog().write(|tx| tx.purge_jobs(100))?,
-        1,
-        "the first has one queued"
-    );
-    assert_eq!(store.catalog().read(|r| r.job_items(second))?, []);
-    Ok(())
-}
-
-#[test]
-fn answers_are_kept_for_a_day_whatever_the_clock_does() -> Result<()> {
-    const DAY: u64 = 24 * 60 * 60;
-    let (_dir, store) = opened();
-    let row = |id: u64, created| RequestRow {
-        client_id: "c".into(),
-        request_id: id.to_string(),
-        request_digest: Digest::of(&id.to_le_bytes()),
-        reply: vec![0, 159, id as u8],
-        created_unix_secs: created,
-    };
-    let catalog = store.catalog();
-    let mut now = 1_000 * DAY;
-    catalog.write(|tx| tx.purge_requests(now, DAY))?;
-    catalog.write(|tx| tx.put_request(&row(1, now)))?;
-    let again = catalog.write(|tx| tx.put_request(&row(1, now)));
-    assert!(
-        matches!(
-            again,
-            Err(StoreError::Exists {
-                table: "requests",
-                ..
-            })
-        ),
-        "{again:?}"
-    );
-    assert_eq!(catalog.read(|r| r.request("c", "1"))?, Some(row(1, now)));
-    assert_eq!(catalog.read(|r| r.request("d", "1"))?, None);
-    // Ten years on in one step, then a day back: nothing is forgotten.
-    for jump in [now + 3_650 * DAY, now - DAY] {
-        assert_eq!(catalog.write(|tx| tx.purge_requests(jump, 0))?, 0);
-        now = jump;
-    }
-    for _ in 0..24 {
-        now += 3_600;
-        assert_eq!(catalog.write(|tx| tx.purge_requests(now, 0))?, 0);
-    }
-    now += 3_600;
-    assert_eq!(catalog.write(|tx| tx.purge_requests(now, 0))?, 1);
-    Ok(())
-}
-
-#[test]
 fn confidence_keeps_its_ends() {
     for (probability, stored) in [
         (0.0, 0),
@@ -524,116 +420,4 @@ fn confidence_keeps_its_ends() {
         assert_eq!(confidence_to_u8(probability), stored);
     }
     assert!((0..=255).all(|stored| confidence_to_u8(confidence_from_u8(stored)) == stored));
-}
-
-/// A reader that began before a commit goes on seeing what was, and neither waits for the other.
-#[test]
-fn readers_neither_wait_nor_see_half() -> Result<()> {
-    let (_dir, store) = opened();
-    add_shape(&store, "chairs", "s0", 0)?;
-    let id = collection_id(&store, "chairs");
-    let (in_transaction, wait_for_transaction) = mpsc::channel();
-    let (read, wait_for_read) = mpsc::channel();
-    let writing = &store;
-    std::thread::scope(|scope| {
-        scope.spawn(move || {
-            writing.catalog().write(|tx| -> Result<()> {
-                tx.set_state(id, b"new")?;
-                in_transaction.send(()).expect("the reader waits");
-                // The reader must get its answer while this transaction is open.
-                wait_for_read
-                    .recv_timeout(Duration::from_secs(60))
-                    .expect("the reader answers");
-                Ok(())
-            })
-        });
-        wait_for_transaction.recv().expect("the writer began");
-        let state = store
-            .catalog()
-            .read(|r| r.collection_by_id(id))
-            .expect("readable");
-        assert_eq!(state.expect("there").state, b"state");
-        read.send(()).expect("the writer waits");
-    });
-    store.catalog().read(|r| -> Result<()> {
-        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
-        // A commit in the middle of this read is not seen by it.
-        store.catalog().write(|tx| tx.set_state(id, b"newer"))?;
-        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
-        Ok(())
-    })
-}
-
-#[test]
-fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
-    let (_dir, store) = opened();
-    add_shape(&store, "chairs", "s0", 0)?;
-    let id = collection_id(&store, "chairs");
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let readers: Vec<_> = (0..6)
-            .map(|_| {
-                scope.spawn(|| {
-                    let mut n_reads = 0;
-                    while n_reads == 0 || !done.load(Ordering::Relaxed) {
-                        store
-                            .catalog()
-                            .read(|r| -> Result<()> {
-                                let collection = r.collection_by_id(id)?.expect("there");
-                                let n_events = r.events_since("chairs", 0, usize::MAX)?.len();
-                                assert_eq!(collection.sequence, n_events as u64);
-                                assert_eq!(collection.next_ordinal, r.n_shapes(id)? + 1);
-                                Ok(())
-                            })
-                            .expect("readable");
-                        n_reads += 1;
-                    }
-                })
-            })
-            .collect();
-        for seed in 1..40 {
-            add_shape(&store, "chairs", &format!("s{seed}"), seed).expect("added");
-        }
-        done.store(true, Ordering::Relaxed);
-        for reader in readers {
-            reader.join().expect("no reader failed");
-        }
-    });
-    Ok(())
-}
-
-#[test]
-fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
-    let (dir, store) = opened();
-    let library = store.dir().to_path_buf();
-    drop(store);
-    let catalog = library.join("catalog.db");
-    let change = |sql: &str| {
-        let connection = rusqlite::Connection::open(&catalog).expect("opens");
-        connection.execute_batch(sql).expect("runs");
-    };
-    change("PRAGMA user_version = 2");
-    let newer = Store::open(&library).err().expect("refused");
-    assert!(
-        matches!(
-            newer,
-            StoreError::Version {
-                found: 2,
-                supported: 1,
-                ..
-            }
-        ),
-        "{newer}"
-    );
-    change("PRAGMA user_version = 1; PRAGMA application_id = 7");
-    assert!(Store::open(&library).err().expect("refused").is_damage());
-    let other = dir.path().join("other");
-    std::fs::create_dir(&other).expect("created");
-    std::fs::write(
-        other.join("catalog.db"),
-        "not a database, but long enough to have a header ".repeat(9),
-    )
-    .expect("written");
-    assert!(Store::open(&other).err().expect("refused").is_damage());
-    Ok(())
 }

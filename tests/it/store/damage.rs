@@ -126,8 +126,7 @@ fn damaged_files_are_never_served_and_the_rest_is() {
     let error = store
         .objects()
         .open_description(&refs[1].object)
-        .err()
-        .expect("refused");
+        .expect_err("refused");
     assert!(error.is_damage(), "{error}");
     assert!(error.to_string().contains(&refs[1].object.file), "{error}");
     for whole in [&refs[0], &refs[2]] {
