@@ -46,6 +46,10 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
         findings.damage(CATALOG_FILE, "the catalog is missing");
         return Ok(findings.list);
     }
+    let log = catalog::log_of(&path);
+    if let Some(message) = catalog::log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
+        findings.damage(relative(dir, &log), message);
+    }
     let connection = match catalog::open_reader(&path) {
         Ok(connection) => connection,
         Err(error) if error.is_damage() => {

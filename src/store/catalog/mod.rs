@@ -7,6 +7,7 @@
 mod collections;
 mod jobs;
 mod labels;
+pub(in crate::store) mod log;
 mod maps;
 mod reader;
 pub(crate) mod schema;
@@ -56,6 +57,14 @@ impl Catalog {
     /// Opens the catalog at `path`, which is created if it is missing. The caller holds the
     /// library's lock.
     pub fn open(path: &Path, health: Health) -> Result<Self, StoreError> {
+        let log = log_of(path);
+        if let Some(message) = log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
+            // Opening would forget the commits behind the damage for good.
+            return Err(StoreError::Damaged {
+                path: log.display().to_string(),
+                message,
+            });
+        }
         let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
             | OpenFlags::SQLITE_OPEN_CREATE
             | OpenFlags::SQLITE_OPEN_NO_MUTEX;
@@ -137,9 +146,7 @@ impl Catalog {
 
     /// Copies the write-ahead log into the file as far as readers allow.
     fn checkpoint_if_due(&self, writer: &mut Writer) -> Result<(), StoreError> {
-        let mut log = self.path.clone().into_os_string();
-        log.push("-wal");
-        let length = std::fs::metadata(&log).map_or(0, |metadata| metadata.len());
+        let length = std::fs::metadata(log_of(&self.path)).map_or(0, |metadata| metadata.len());
         if length < writer.checkpoint_at {
             return Ok(());
         }
@@ -217,6 +224,13 @@ pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
     connection.set_prepared_statement_cache_capacity(64);
     schema::check_format(&connection, &path.display().to_string())?;
     Ok(connection)
+}
+
+/// The write-ahead log of the catalog at `path`.
+pub(super) fn log_of(path: &Path) -> PathBuf {
+    let mut log = path.to_path_buf().into_os_string();
+    log.push("-wal");
+    log.into()
 }
 
 /// The catalog's path in a library folder.
