@@ -22,6 +22,7 @@ pub mod synth;
 // Shell: files, sockets, clocks.
 pub mod store;
 pub mod library;
+pub mod config;
 pub mod ipc;
 pub mod daemon;
 

@@ -99,7 +99,7 @@ pub fn write_description(
     metadata.insert("format".into(), ARRAY_FORMAT.to_string().into());
     metadata.insert("area".into(), description.area.to_string().into());
     metadata.insert("params".into(), params_json.into());
-    for (key, value) in report_fields(&description.report) {
+    for (key, value) in description.report.counts() {
         metadata.insert(key.into(), value.to_string().into());
     }
     let mut header = serde_json::Map::new();
@@ -399,56 +399,6 @@ fn number<T: std::str::FromStr>(
     })
 }
 
-/// Every counter of the report with the key it is stored under. Taken apart without `..`, so that a
-/// new counter cannot be forgotten here.
-fn report_fields(report: &CleanReport) -> [(&'static str, usize); 13] {
-    let CleanReport {
-        n_polygons,
-        n_triangles,
-        n_vertices,
-        n_welded_vertices,
-        n_isolated_vertices,
-        n_degenerate_triangles,
-        n_duplicate_triangles,
-        n_nonmanifold_edges,
-        n_boundary_edges,
-        n_components,
-        n_proxy_faces,
-        n_proxy_vertices,
-        n_bridges,
-    } = *report;
-    [
-        ("report.n_polygons", n_polygons),
-        ("report.n_triangles", n_triangles),
-        ("report.n_vertices", n_vertices),
-        ("report.n_welded_vertices", n_welded_vertices),
-        ("report.n_isolated_vertices", n_isolated_vertices),
-        ("report.n_degenerate_triangles", n_degenerate_triangles),
-        ("report.n_duplicate_triangles", n_duplicate_triangles),
-        ("report.n_nonmanifold_edges", n_nonmanifold_edges),
-        ("report.n_boundary_edges", n_boundary_edges),
-        ("report.n_components", n_components),
-        ("report.n_proxy_faces", n_proxy_faces),
-        ("report.n_proxy_vertices", n_proxy_vertices),
-        ("report.n_bridges", n_bridges),
-    ]
-}
-
 fn report_from(metadata: &Metadata) -> Result<CleanReport, ArrayFileError> {
-    let count = |key| number(metadata, key, "a count");
-    Ok(CleanReport {
-        n_polygons: count("report.n_polygons")?,
-        n_triangles: count("report.n_triangles")?,
-        n_vertices: count("report.n_vertices")?,
-        n_welded_vertices: count("report.n_welded_vertices")?,
-        n_isolated_vertices: count("report.n_isolated_vertices")?,
-        n_degenerate_triangles: count("report.n_degenerate_triangles")?,
-        n_duplicate_triangles: count("report.n_duplicate_triangles")?,
-        n_nonmanifold_edges: count("report.n_nonmanifold_edges")?,
-        n_boundary_edges: count("report.n_boundary_edges")?,
-        n_components: count("report.n_components")?,
-        n_proxy_faces: count("report.n_proxy_faces")?,
-        n_proxy_vertices: count("report.n_proxy_vertices")?,
-        n_bridges: count("report.n_bridges")?,
-    })
+    CleanReport::from_counts(|name| number(metadata, name, "a count"))
 }

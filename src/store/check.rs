@@ -318,11 +318,9 @@ fn check_labels(
         if let Some(described) = described {
             let n_faces = described.n_faces as u64;
             lengths.push(("proxy labels", labels.proxy_labels.len() as u64, n_faces));
-            lengths.push((
-                "proxy confidences",
-                labels.proxy_confidence.len() as u64,
-                n_faces,
-            ));
+            let found = labels.proxy_probabilities.len() as u64;
+            let expected = found.div_ceil(n_faces.max(1)).max(1) * n_faces;
+            lengths.push(("proxy probabilities", found, expected));
         }
         for (what, found, expected) in lengths {
             if found != expected {

@@ -82,7 +82,7 @@ fn label_version(shape: &Description, version: u64, sequence: u64) -> LabelVersi
         sequence,
         cause: "added".into(),
         proxy_labels: (0..m).map(label).collect(),
-        proxy_confidence: (0..m)
+        proxy_probabilities: (0..3 * m)
             .map(|i| confidence_to_u8(i as f32 / m as f32))
             .collect(),
         polygon_labels: (0..n_polygons).map(label).collect(),

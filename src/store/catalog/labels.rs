@@ -19,7 +19,7 @@ fn label_version_row(fields: &Fields<'_>) -> Result<LabelVersionRow> {
         sequence: fields.get("sequence")?,
         cause: fields.get("cause")?,
         proxy_labels: fields.unpack("proxy_labels", unpack_labels)?,
-        proxy_confidence: fields.unpack("proxy_confidence", unpack_bytes)?,
+        proxy_probabilities: fields.unpack("proxy_probabilities", unpack_bytes)?,
         polygon_labels: fields.unpack("polygon_labels", unpack_labels)?,
         polygon_confidence: fields.unpack("polygon_confidence", unpack_bytes)?,
         sources_json: fields.get("sources")?,
@@ -153,9 +153,9 @@ impl Tx<'_> {
             row.n_polygons,
         )?;
         must(
-            "number of proxy confidences",
-            labels.proxy_confidence.len() as u64,
-            labels.proxy_labels.len() as u64,
+            "remainder of proxy probabilities by proxy faces",
+            (labels.proxy_probabilities.len() % labels.proxy_labels.len().max(1)) as u64,
+            0,
         )?;
         self.insert(
             &LABEL_VERSIONS,
@@ -166,7 +166,7 @@ impl Tx<'_> {
                 labels.sequence,
                 labels.cause,
                 pack_labels(&labels.proxy_labels),
-                pack_bytes(&labels.proxy_confidence),
+                pack_bytes(&labels.proxy_probabilities),
                 pack_labels(&labels.polygon_labels),
                 pack_bytes(&labels.polygon_confidence),
                 labels.sources_json,

@@ -102,7 +102,7 @@ impl Catalog {
     }
 
     /// Runs `change` in a transaction, which is durable when this returns `Ok`, and leaves no trace
-    /// otherwise.
+    /// otherwise. Not to be called within a change: there is one writer, and it is busy.
     pub fn write<T, E: From<StoreError>>(
         &self,
         change: impl FnOnce(&Tx<'_>) -> Result<T, E>,

@@ -137,12 +137,12 @@ tables! {
      stats BLOB NOT NULL, sum INTEGER"
 
     LABEL_VERSIONS "label_versions" key 2 [
-        "shape_id", "version", "sequence", "cause", "proxy_labels", "proxy_confidence",
+        "shape_id", "version", "sequence", "cause", "proxy_labels", "proxy_probabilities",
         "polygon_labels", "polygon_confidence", "sources",
     ]
     "shape_id INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, version INTEGER NOT NULL,
      sequence INTEGER NOT NULL, cause TEXT NOT NULL, proxy_labels BLOB NOT NULL,
-     proxy_confidence BLOB NOT NULL, polygon_labels BLOB NOT NULL,
+     proxy_probabilities BLOB NOT NULL, polygon_labels BLOB NOT NULL,
      polygon_confidence BLOB NOT NULL, sources TEXT NOT NULL, sum INTEGER,
      PRIMARY KEY (shape_id, version)"
 

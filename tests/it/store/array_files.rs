@@ -84,7 +84,7 @@ fn the_file_is_plain_safetensors() {
     assert_eq!(header["__metadata__"]["format"], "1");
     assert_eq!(header["__metadata__"]["params"], PARAMS);
     assert_eq!(header["__metadata__"]["area"], "12.25");
-    assert_eq!(header["__metadata__"]["report.n_bridges"], "9");
+    assert_eq!(header["__metadata__"]["n_bridges"], "9");
     let expected = [
         ("vertices", "F32", json!([21, 3])),
         ("faces", "U32", json!([19, 3])),
@@ -285,7 +285,7 @@ fn headers_that_lie_are_refused() {
             "{at}: {error} should speak of {message}"
         );
     }
-    for key in ["format", "area", "params", "report.n_bridges"] {
+    for key in ["format", "area", "params", "n_bridges"] {
         let error = changed(&|h| {
             h["__metadata__"]
                 .as_object_mut()

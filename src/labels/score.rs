@@ -1,0 +1,395 @@
+//! Predicted and true labels of a collection become figures of how well they agree.
+//!
+//! Accuracy is over the collection, not over each shape: one assignment of predicted to true labels must
+//! serve all shapes, so that labels which mean different things on different shapes cost what they should.
+//! Rand error: X. Chen, A. Golovinskiy and T. Funkhouser, "A benchmark for 3D mesh segmentation", 2009.
+
+use crate::linalg::assignment::assignment;
+use crate::mesh::TriMesh;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+/// A shape with its true labels and what was predicted.
+#[derive(Debug, Clone, Copy)]
+pub struct ScoredShape<'a> {
+    /// Its mesh, m faces.
+    pub mesh: &'a TriMesh,
+    /// True labels, `(m,)`.
+    pub truth: &'a [i32],
+    /// Predicted labels, `(m,)`; negative is 'no label' and is wrong. `None`: the whole shape is wrong.
+    pub predicted: Option<&'a [i32]>,
+}
+
+/// How well predicted labels agree with true ones.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Score {
+    /// Shapes scored.
+    pub n_shapes: usize,
+    /// Shapes without a prediction.
+    pub n_missing: usize,
+    /// Mean over shapes of the area share with the right label after the assignment, 0 to 1.
+    pub accuracy: f64,
+    /// The same when each predicted label may take its best true label, several the same one.
+    pub purity: f64,
+    /// One minus the Rand index of the connected pieces, by faces, averaged over predicted shapes;
+    /// `None` without predictions.
+    pub rand_error: Option<f64>,
+    /// Predicted labels in use.
+    pub n_predicted_labels: usize,
+    /// True labels in use.
+    pub n_true_labels: usize,
+    /// Pairs of predicted and true label, by predicted label. One-to-one.
+    pub assignment: Vec<(i32, i32)>,
+    /// Accuracy of each shape, in the order given.
+    pub shapes: Vec<f64>,
+}
+
+/// Why a collection cannot be scored.
+#[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
+pub enum ScoreError {
+    /// There is nothing to average over.
+    #[error("no shapes to score")]
+    Empty,
+    /// A list of labels does not fit its mesh.
+    #[error("shape {shape} has {n_labels} {which} labels, but the mesh has {n_faces} faces")]
+    Count {
+        /// Position of the shape.
+        shape: usize,
+        /// `true` or `predicted`.
+        which: &'static str,
+        /// Labels given.
+        n_labels: usize,
+        /// Faces of the mesh.
+        n_faces: usize,
+    },
+    /// The share of each face cannot be computed.
+    #[error("shape {shape} has area {area}, which must be positive and finite")]
+    Area {
+        /// Position of the shape.
+        shape: usize,
+        /// Its total area, as text since it may not be a number.
+        area: String,
+    },
+}
+
+/// Scores the predictions for a collection; every shape weighs 1, whatever its size.
+///
+/// The assignment maximises the pooled area share on its diagonal (Hungarian method). Cost: linear in the
+/// faces, O(m log m) for the connected pieces.
+pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
+    if shapes.is_empty() {
+        return Err(ScoreError::Empty);
+    }
+    let mut shares = Vec::with_capacity(shapes.len());
+    for (i, shape) in shapes.iter().enumerate() {
+        shares.push(area_shares(i, shape)?);
+    }
+    // One row per predicted label, one column per true one.
+    let true_labels: Vec<i32> = distinct(shapes.iter().flat_map(|s| s.truth));
+    let given = shapes.iter().filter_map(|s| s.predicted).flatten();
+    let predicted_labels: Vec<i32> = distinct(given.filter(|&&p| p >= 0));
+    let (n_rows, n_cols) = (predicted_labels.len(), true_labels.len());
+    let row_of: HashMap<i32, usize> = (0..n_rows).map(|i| (predicted_labels[i], i)).collect();
+    let col_of: HashMap<i32, usize> = (0..n_cols).map(|j| (true_labels[j], j)).collect();
+    let mut overlap = vec![0.0; n_rows * n_cols];
+    for (shape, share) in shapes.iter().zip(&shares) {
+        for ((p, t), a) in shape
+            .predicted
+            .unwrap_or(&[])
+            .iter()
+            .zip(shape.truth)
+            .zip(share)
+        {
+            if let Some(i) = row_of.get(p) {
+                overlap[i * n_cols + col_of[t]] += a;
+            }
+        }
+    }
+    let cost: Vec<f64> = overlap.iter().map(|x| -x).collect();
+    let columns = assignment(&cost, n_rows, n_cols);
+    let pairs: BTreeMap<i32, i32> = (0..n_rows)
+        .filter_map(|i| columns[i].map(|j| (predicted_labels[i], true_labels[j])))
+        .collect();
+
+    let n = shapes.len() as f64;
+    let per_shape: Vec<f64> = shapes
+        .iter()
+        .zip(&shares)
+        .map(|(shape, share)| {
+            let faces = shape
+                .predicted
+                .unwrap_or(&[])
+                .iter()
+                .zip(shape.truth)
+                .zip(share);
+            faces
+                .filter(|((p, t), _)| pairs.get(p) == Some(t))
+                .map(|(_, a)| a)
+                .sum()
+        })
+        .collect();
+    let best_of_row = |row: &[f64]| row.iter().copied().fold(0.0, f64::max);
+    let rand: Vec<f64> = shapes
+        .iter()
+        .filter_map(|s| s.predicted.map(|p| rand_error(s.mesh, p, s.truth)))
+        .collect();
+    Ok(Score {
+        n_shapes: shapes.len(),
+        n_missing: shapes.iter().filter(|s| s.predicted.is_none()).count(),
+        accuracy: per_shape.iter().sum::<f64>() / n,
+        purity: overlap.chunks(n_cols.max(1)).map(best_of_row).sum::<f64>() / n,
+        rand_error: (!rand.is_empty()).then(|| rand.iter().sum::<f64>() / rand.len() as f64),
+        n_predicted_labels: n_rows,
+        n_true_labels: n_cols,
+        assignment: pairs.into_iter().collect(),
+        shapes: per_shape,
+    })
+}
+
+fn distinct<'a>(labels: impl Iterator<Item = &'a i32>) -> Vec<i32> {
+    labels
+        .copied()
+        .collect::<BTreeSet<_>>()
+        .into_iter()
+        .collect()
+}
+
+/// Each face's share of the shape's area, summing to 1.
+fn area_shares(i: usize, shape: &ScoredShape<'_>) -> Result<Vec<f64>, ScoreError> {
+    let n_faces = shape.mesh.faces.len();
+    let count = |which, n_labels| ScoreError::Count {
+        shape: i,
+        which,
+        n_labels,
+        n_faces,
+    };
+    if shape.truth.len() != n_faces {
+        return Err(count("true", shape.truth.len()));
+    }
+    if let Some(p) = shape.predicted.filter(|p| p.len() != n_faces) {
+        return Err(count("predicted", p.len()));
+    }
+    let corner = |v: u32| shape.mesh.vertices[v as usize];
+    let areas: Vec<f64> = shape
+        .mesh
+        .faces
+        .iter()
+        .map(|&[a, b, c]| {
+            let (o, p, q) = (corner(a), corner(b), corner(c));
+            let u = [p[0] - o[0], p[1] - o[1], p[2] - o[2]];
+            let v = [q[0] - o[0], q[1] - o[1], q[2] - o[2]];
+            let x = u[1] * v[2] - u[2] * v[1];
+            let y = u[2] * v[0] - u[0] * v[2];
+            let z = u[0] * v[1] - u[1] * v[0];
+            (x * x + y * y + z * z).sqrt() / 2.0
+        })
+        .collect();
+    let total: f64 = areas.iter().sum();
+    if !(total > 0.0 && total.is_finite()) {
+        return Err(ScoreError::Area {
+            shape: i,
+            area: total.to_string(),
+        });
+    }
+    Ok(areas.into_iter().map(|a| a / total).collect())
+}
+
+/// One minus the Rand index of two segmentations of one mesh into connected pieces of equal label: the
+/// share of pairs of faces that are together in one and apart in the other. 0 for fewer than two faces.
+///
+/// # Panics
+///
+/// If a list of labels is shorter than the faces.
+pub fn rand_error(mesh: &TriMesh, one: &[i32], other: &[i32]) -> f64 {
+    let n = mesh.faces.len() as f64;
+    if mesh.faces.len() < 2 {
+        return 0.0;
+    }
+    let (s, t) = (pieces(&mesh.faces, one), pieces(&mesh.faces, other));
+    let squares =
+        |counts: BTreeMap<(usize, usize), f64>| counts.values().map(|c| c * c).sum::<f64>();
+    let mut joint = BTreeMap::new();
+    let (mut first, mut second) = (BTreeMap::new(), BTreeMap::new());
+    for (&a, &b) in s.iter().zip(&t) {
+        *joint.entry((a, b)).or_insert(0.0) += 1.0;
+        *first.entry((a, 0)).or_insert(0.0) += 1.0;
+        *second.entry((b, 0)).or_insert(0.0) += 1.0;
+    }
+    (squares(first) / 2.0 + squares(second) / 2.0 - squares(joint)) / (n * (n - 1.0) / 2.0)
+}
+
+/// A piece per face, `(m,)`: faces of equal label that are connected across shared edges, numbered by
+/// their first face.
+pub fn pieces(faces: &[[u32; 3]], labels: &[i32]) -> Vec<usize> {
+    let mut edges: Vec<([u32; 2], usize)> = Vec::with_capacity(3 * faces.len());
+    for (f, &[a, b, c]) in faces.iter().enumerate() {
+        edges.extend([(a, b), (b, c), (c, a)].map(|(u, v)| ([u.min(v), u.max(v)], f)));
+    }
+    edges.sort_unstable();
+    let mut parent: Vec<usize> = (0..faces.len()).collect();
+    for pair in edges.windows(2) {
+        let ((e, f), (d, g)) = (pair[0], pair[1]);
+        if e == d && labels[f] == labels[g] {
+            let (a, b) = (root(&mut parent, f), root(&mut parent, g));
+            parent[a.max(b)] = a.min(b);
+        }
+    }
+    (0..faces.len()).map(|f| root(&mut parent, f)).collect()
+}
+
+fn root(parent: &mut [usize], mut i: usize) -> usize {
+    while parent[i] != i {
+        parent[i] = parent[parent[i]];
+        i = parent[i];
+    }
+    i
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ScoreError, ScoredShape, pieces, rand_error, score};
+    use crate::mesh::TriMesh;
+
+    const TOLERANCE: f64 = 1e-12;
+
+    /// A strip of right triangles along x whose areas are `widths / 2`.
+    fn strip(widths: &[f64]) -> TriMesh {
+        let mut mesh = TriMesh {
+            vertices: vec![[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+            faces: vec![],
+        };
+        let mut ends = [0.0, 0.0];
+        for (i, w) in widths.iter().enumerate() {
+            let n = mesh.vertices.len() as u32;
+            ends[i % 2] += w;
+            mesh.vertices.push([ends[i % 2], (i % 2) as f64, 0.0]);
+            mesh.faces.push([n - 2, n - 1, n]);
+        }
+        mesh
+    }
+
+    #[test]
+    fn strip_areas_are_the_widths() {
+        // Widths must be measured along the side a triangle has its base on.
+        let mesh = strip(&[1.0, 3.0]);
+        assert_eq!(mesh.vertices.len(), 4);
+        assert_eq!(mesh.faces, [[0, 1, 2], [1, 2, 3]]);
+    }
+
+    #[test]
+    fn one_assignment_serves_all_shapes() {
+        // Shape 1 agrees up to names; shape 2 uses the names the other way round, so it is wrong.
+        let mesh = strip(&[1.0, 1.0, 1.0, 1.0]);
+        let truth = [0, 0, 1, 1];
+        let (p1, p2) = ([7, 7, 3, 3], [3, 3, 7, 3]);
+        let shapes = [
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&p1),
+            },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&p2),
+            },
+        ];
+        let s = score(&shapes).unwrap();
+        // Pooled overlap: 7 with 0: .5, 7 with 1: .25, 3 with 0: .5, 3 with 1: .75.
+        assert_eq!(s.assignment, [(3, 1), (7, 0)]);
+        assert!((s.shapes[0] - 1.0).abs() < TOLERANCE);
+        assert!((s.shapes[1] - 0.25).abs() < TOLERANCE);
+        assert!((s.accuracy - 0.625).abs() < TOLERANCE);
+        assert!((s.purity - 0.625).abs() < TOLERANCE);
+        assert_eq!(
+            (s.n_predicted_labels, s.n_true_labels, s.n_missing),
+            (2, 2, 0)
+        );
+    }
+
+    #[test]
+    fn faces_weigh_by_area() {
+        let mesh = strip(&[1.0, 3.0]);
+        let s = score(&[ScoredShape {
+            mesh: &mesh,
+            truth: &[0, 1],
+            predicted: Some(&[5, 5]),
+        }]);
+        let s = s.unwrap();
+        assert_eq!(s.assignment, [(5, 1)]);
+        assert!((s.accuracy - 0.75).abs() < TOLERANCE);
+    }
+
+    #[test]
+    fn over_splitting_costs_accuracy_but_not_purity() {
+        let mesh = strip(&[1.0; 4]);
+        let shape = ScoredShape {
+            mesh: &mesh,
+            truth: &[0, 0, 0, 1],
+            predicted: Some(&[1, 1, 2, 3]),
+        };
+        let s = score(&[shape]).unwrap();
+        assert!((s.accuracy - 0.75).abs() < TOLERANCE);
+        assert!((s.purity - 1.0).abs() < TOLERANCE);
+    }
+
+    #[test]
+    fn unlabelled_and_missing_are_wrong() {
+        let mesh = strip(&[1.0; 4]);
+        let truth = [0, 0, 1, 1];
+        let shapes = [
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: Some(&[0, -1, -1, 1]),
+            },
+            ScoredShape {
+                mesh: &mesh,
+                truth: &truth,
+                predicted: None,
+            },
+        ];
+        let s = score(&shapes).unwrap();
+        assert!((s.accuracy - 0.25).abs() < TOLERANCE);
+        assert_eq!((s.n_missing, s.n_predicted_labels), (1, 2));
+        let none = score(&shapes[1..]).unwrap();
+        assert_eq!(
+            (none.accuracy, none.purity, none.rand_error),
+            (0.0, 0.0, None)
+        );
+    }
+
+    #[test]
+    fn rand_error_counts_pairs() {
+        let mesh = strip(&[1.0; 4]);
+        assert_eq!(rand_error(&mesh, &[0, 0, 1, 1], &[5, 5, 2, 2]), 0.0);
+        // One piece against two halves: the 4 pairs across are together in one and apart in the other.
+        let e = rand_error(&mesh, &[0, 0, 0, 0], &[0, 0, 1, 1]);
+        assert!((e - 4.0 / 6.0).abs() < TOLERANCE);
+        // Equal labels in separate pieces are separate segments.
+        let e = rand_error(&mesh, &[0, 1, 1, 0], &[0, 1, 1, 2]);
+        assert_eq!(e, 0.0);
+        assert_eq!(pieces(&mesh.faces, &[0, 1, 1, 0]), [0, 1, 1, 3]);
+    }
+
+    #[test]
+    fn says_what_does_not_fit() {
+        let mesh = strip(&[1.0; 4]);
+        let short = ScoredShape {
+            mesh: &mesh,
+            truth: &[0; 4],
+            predicted: Some(&[0; 3]),
+        };
+        assert_eq!(
+            score(&[short]).unwrap_err().to_string(),
+            "shape 0 has 3 predicted labels, but the mesh has 4 faces"
+        );
+        assert_eq!(score(&[]), Err(ScoreError::Empty));
+        let flat = strip(&[0.0]);
+        let flat = ScoredShape {
+            mesh: &flat,
+            truth: &[0],
+            predicted: None,
+        };
+        assert!(matches!(score(&[flat]), Err(ScoreError::Area { .. })));
+    }
+}

@@ -1,0 +1,231 @@
+//! A mesh, with labels and colours where the format has room for them, becomes the bytes of a file.
+//!
+//! Coordinates are written with as many digits as it takes to read the same number back; labels keep the
+//! order of the polygons.
+
+use super::TriMesh;
+use std::fmt::Write;
+
+/// Object File Format text.
+pub fn off(mesh: &TriMesh) -> String {
+    let mut out = String::with_capacity(60 * mesh.vertices.len() + 20 * mesh.faces.len());
+    out.push_str("OFF\n");
+    line(
+        &mut out,
+        format_args!("{} {} 0", mesh.vertices.len(), mesh.faces.len()),
+    );
+    for [x, y, z] in &mesh.vertices {
+        line(&mut out, format_args!("{x} {y} {z}"));
+    }
+    for [a, b, c] in &mesh.faces {
+        line(&mut out, format_args!("3 {a} {b} {c}"));
+    }
+    out
+}
+
+/// Wavefront OBJ text: a group and a material `label_N` (`unlabelled` below 0) for every run of polygons of
+/// one label. `material_file`: the name of a file with the text of [`mtl`].
+///
+/// # Panics
+///
+/// If there is not one label per polygon.
+pub fn obj<P: AsRef<[u32]>>(
+    vertices: &[[f64; 3]],
+    polygons: &[P],
+    labels: &[i32],
+    material_file: Option<&str>,
+) -> String {
+    assert_eq!(polygons.len(), labels.len(), "one label per polygon");
+    let mut out = String::with_capacity(60 * vertices.len() + 20 * polygons.len());
+    if let Some(name) = material_file {
+        line(&mut out, format_args!("mtllib {name}"));
+    }
+    for [x, y, z] in vertices {
+        line(&mut out, format_args!("v {x} {y} {z}"));
+    }
+    let mut current = None;
+    for (polygon, &label) in polygons.iter().zip(labels) {
+        if current != Some(label) {
+            current = Some(label);
+            let name = material(label);
+            line(&mut out, format_args!("g {name}"));
+            if material_file.is_some() {
+                line(&mut out, format_args!("usemtl {name}"));
+            }
+        }
+        out.push('f');
+        for corner in polygon.as_ref() {
+            // OBJ counts from 1; u64 holds the successor of every u32.
+            append(&mut out, format_args!(" {}", u64::from(*corner) + 1));
+        }
+        out.push('\n');
+    }
+    out
+}
+
+/// The materials [`obj`] names, as MTL text: one diffuse sRGB colour per label.
+pub fn mtl(colours: &[(i32, [u8; 3])]) -> String {
+    let mut out = String::new();
+    for (label, colour) in colours {
+        let [r, g, b] = colour.map(|c| f64::from(c) / 255.0);
+        line(&mut out, format_args!("newmtl {}", material(*label)));
+        line(&mut out, format_args!("Kd {r:.4} {g:.4} {b:.4}"));
+    }
+    out
+}
+
+fn material(label: i32) -> String {
+    if label < 0 {
+        "unlabelled".to_owned()
+    } else {
+        format!("label_{label}")
+    }
+}
+
+/// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and `int label`.
+///
+/// # Panics
+///
+/// If there is not one colour and one label per polygon.
+pub fn ply<P: AsRef<[u32]>>(
+    vertices: &[[f64; 3]],
+    polygons: &[P],
+    colours: &[[u8; 3]],
+    labels: &[i32],
+) -> Vec<u8> {
+    assert_eq!(polygons.len(), colours.len(), "one colour per polygon");
+    assert_eq!(polygons.len(), labels.len(), "one label per polygon");
+    // A one-byte count is what most readers expect; it is widened only when a polygon needs it.
+    let wide = polygons
+        .iter()
+        .any(|p| p.as_ref().len() > usize::from(u8::MAX));
+    let count = if wide { "uint" } else { "uchar" };
+    let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
+    line(
+        &mut header,
+        format_args!("element vertex {}", vertices.len()),
+    );
+    header.push_str("property double x\nproperty double y\nproperty double z\n");
+    line(&mut header, format_args!("element face {}", polygons.len()));
+    line(
+        &mut header,
+        format_args!("property list {count} uint vertex_indices"),
+    );
+    header.push_str("property uchar red\nproperty uchar green\nproperty uchar blue\n");
+    header.push_str("property int label\nend_header\n");
+    let mut out = header.into_bytes();
+    for x in vertices.iter().flatten() {
+        out.extend_from_slice(&x.to_le_bytes());
+    }
+    for ((polygon, colour), label) in polygons.iter().zip(colours).zip(labels) {
+        let corners = polygon.as_ref();
+        if wide {
+            out.extend_from_slice(&(corners.len() as u32).to_le_bytes());
+        } else {
+            out.push(corners.len() as u8);
+        }
+        for corner in corners {
+            out.extend_from_slice(&corner.to_le_bytes());
+        }
+        out.extend_from_slice(colour);
+        out.extend_from_slice(&label.to_le_bytes());
+    }
+    out
+}
+
+fn line(out: &mut String, text: std::fmt::Arguments<'_>) {
+    append(out, text);
+    out.push('\n');
+}
+
+fn append(out: &mut String, text: std::fmt::Arguments<'_>) {
+    out.write_fmt(text)
+        .expect("invariant: writing to a string cannot fail");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{mtl, obj, off, ply};
+    use crate::mesh::TriMesh;
+
+    fn two_triangles() -> TriMesh {
+        TriMesh {
+            vertices: vec![
+                [0.0, 0.0, 0.0],
+                [1.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0],
+                [0.1, 1e-7, -2.5],
+            ],
+            faces: vec![[0, 1, 2], [2, 1, 3]],
+        }
+    }
+
+    #[test]
+    fn off_reads_back_exactly() {
+        let mesh = two_triangles();
+        let text = off(&mesh);
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines[..2], ["OFF", "4 2 0"]);
+        assert_eq!(lines[6..], ["3 0 1 2", "3 2 1 3"]);
+        for (line, vertex) in lines[2..6].iter().zip(&mesh.vertices) {
+            let read: Vec<f64> = line.split(' ').map(|t| t.parse().unwrap()).collect();
+            assert_eq!(read, vertex);
+        }
+    }
+
+    #[test]
+    fn obj_keeps_the_order_and_groups_runs() {
+        let mesh = two_triangles();
+        let polygons = [vec![0, 1, 2], vec![2, 1, 3], vec![0, 1, 3, 2]];
+        let text = obj(&mesh.vertices, &polygons, &[4, 4, -1], Some("a.mtl"));
+        let rest: Vec<&str> = text.lines().filter(|l| !l.starts_with("v ")).collect();
+        let expected = [
+            "mtllib a.mtl",
+            "g label_4",
+            "usemtl label_4",
+            "f 1 2 3",
+            "f 3 2 4",
+            "g unlabelled",
+            "usemtl unlabelled",
+            "f 1 2 4 3",
+        ];
+        assert_eq!(rest, expected);
+        assert_eq!(
+            mtl(&[(4, [255, 0, 51])]),
+            "newmtl label_4\nKd 1.0000 0.0000 0.2000\n"
+        );
+        assert!(!obj(&mesh.vertices, &mesh.faces, &[0, 1], None).contains("mtl"));
+    }
+
+    #[test]
+    fn ply_has_the_bytes_its_header_promises() {
+        let mesh = two_triangles();
+        let bytes = ply(
+            &mesh.vertices,
+            &mesh.faces,
+            &[[1, 2, 3], [4, 5, 6]],
+            &[9, -1],
+        );
+        let end = b"end_header\n";
+        let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
+        let header = std::str::from_utf8(&bytes[..at]).unwrap();
+        assert!(header.contains("element vertex 4\n") && header.contains("element face 2\n"));
+        let body = &bytes[at..];
+        assert_eq!(body.len(), 4 * 24 + 2 * (1 + 12 + 3 + 4));
+        assert_eq!(body[3 * 24..3 * 24 + 8], 0.1f64.to_le_bytes());
+        let face = &body[4 * 24 + 20..];
+        assert_eq!(face[0], 3);
+        assert_eq!(face[1..5], 2u32.to_le_bytes());
+        assert_eq!(face[13..16], [4, 5, 6]);
+        assert_eq!(face[16..20], (-1i32).to_le_bytes());
+    }
+
+    #[test]
+    fn ply_widens_the_count_for_large_polygons() {
+        let polygon: Vec<u32> = (0..300).collect();
+        let vertices = vec![[0.0; 3]; 300];
+        let bytes = ply(&vertices, &[polygon], &[[0; 3]], &[0]);
+        let header = String::from_utf8_lossy(&bytes[..300]).into_owned();
+        assert!(header.contains("property list uint uint vertex_indices"));
+    }
+}
