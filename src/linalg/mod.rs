@@ -4,3 +4,6 @@ pub mod block_lanczos;
 pub mod dense_eigen;
 pub mod ldlt;
 pub mod panel;
+
+#[cfg(test)]
+mod spectral_tests;
