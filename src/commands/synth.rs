@@ -162,7 +162,7 @@ fn write(path: &Path, text: &str) -> Result<(), SynthError> {
 
 #[cfg(test)]
 mod tests {
-    use super::{SynthArgs, list, run};
+    use super::{SynthArgs, list, write_family};
     use clap::Parser;
 
     #[derive(Debug, Parser)]
@@ -185,7 +185,8 @@ mod tests {
             "--out",
             out.to_str().unwrap(),
         ];
-        run(&Cli::try_parse_from(typed).unwrap().synth).unwrap();
+        let report = write_family(&Cli::try_parse_from(typed).unwrap().synth).unwrap();
+        assert!(report.starts_with("2 shapes of family pliers (3 parts) in "));
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .unwrap()
             .map(|f| f.unwrap().file_name().into_string().unwrap())
