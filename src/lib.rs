@@ -22,8 +22,8 @@ pub mod synth;
 // Shell: files, sockets, clocks.
 pub mod store;
 pub mod library;
+pub mod config;
 pub mod ipc;
 pub mod daemon;
-pub mod commands;
 
 pub use library::Library;

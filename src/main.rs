@@ -1,2 +1,21 @@
-//! The `coseg` command.
-fn main() {}
+//! The `coseg` command: the daemon and its clients.
+
+mod cli;
+mod commands;
+mod telemetry;
+
+use clap::Parser as _;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = cli::Cli::parse();
+    match commands::run(cli) {
+        Ok(code) => code,
+        Err(e) => {
+            if !e.is_silent() {
+                eprintln!("coseg: {e}");
+            }
+            e.exit_code()
+        }
+    }
+}

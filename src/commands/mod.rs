@@ -1,3 +1,137 @@
 //! What each subcommand does: one file each.
 
-pub mod synth;
+mod add;
+mod check;
+mod collections;
+mod config;
+pub(crate) mod describe;
+mod events;
+mod export;
+mod export_mesh;
+mod json;
+mod labels;
+mod ls;
+mod map;
+mod name;
+mod nearest;
+mod rm;
+mod serve;
+mod session;
+mod show;
+mod stats;
+mod stop;
+pub(crate) mod synth;
+mod wait;
+mod watch;
+
+use crate::cli::{Cli, Command, exit};
+use coseg::config::ConfigError;
+use coseg::daemon::ServeError;
+use coseg::ipc::client::ClientError;
+use coseg::ipc::endpoint::EndpointError;
+use coseg::library::LibraryError;
+use session::Session;
+use std::process::ExitCode;
+
+/// Why a command did not do what was asked.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum CommandError {
+    /// The daemon did not answer, or refused.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// The configuration is wrong.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The daemon did not start.
+    #[error(transparent)]
+    Serve(#[from] ServeError),
+    /// A library could not be used without a daemon.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
+    /// Logging cannot be set up.
+    #[error(transparent)]
+    Telemetry(#[from] crate::telemetry::TelemetryError),
+    /// Shapes could not be made.
+    #[error(transparent)]
+    Synth(#[from] synth::SynthError),
+    /// What was typed cannot be meant.
+    #[error("{0}")]
+    Usage(String),
+    /// Something did not work.
+    #[error("{0}")]
+    Failed(String),
+    /// A file could not be read or written.
+    #[error("{path}: {source}")]
+    File {
+        /// Which one.
+        path: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Nobody reads the output any more.
+    #[error("stdout: {0}")]
+    Output(std::io::Error),
+}
+
+impl CommandError {
+    /// As documented in `coseg --help`.
+    pub(crate) fn exit_code(&self) -> ExitCode {
+        let code = match self {
+            Self::Client(ClientError::NoAnswer { .. }) => exit::NO_ANSWER,
+            Self::Client(ClientError::Endpoint(_)) | Self::Usage(_) | Self::Config(_) => exit::USAGE,
+            Self::Serve(ServeError::Start(e)) if e.is_configuration() => exit::USAGE,
+            Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe => 0,
+            Self::Client(_)
+            | Self::Serve(_)
+            | Self::Library(_)
+            | Self::Telemetry(_)
+            | Self::Synth(_)
+            | Self::Failed(_)
+            | Self::File { .. }
+            | Self::Output(_) => exit::FAILED,
+        };
+        ExitCode::from(code)
+    }
+
+    /// Whether there is nothing to say about it.
+    pub(crate) fn is_silent(&self) -> bool {
+        matches!(self, Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe)
+    }
+}
+
+impl From<EndpointError> for CommandError {
+    fn from(e: EndpointError) -> Self {
+        Self::Client(e.into())
+    }
+}
+
+/// Whether all that was asked for was done; words about the rest were printed.
+pub(crate) type Outcome = Result<bool, CommandError>;
+
+/// Carries out one command.
+pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
+    let session = || Session::open(&cli.global);
+    let done = match &cli.command {
+        Command::Serve(args) => serve::run(args, &cli.global),
+        Command::Check(args) => check::run(args, &cli.global),
+        Command::Describe(args) => describe::run(args, &cli.global),
+        Command::Config(args) => config::run(args, &cli.global),
+        Command::Add(args) => add::run(args, session()?),
+        Command::Wait(args) => wait::run(args, session()?),
+        Command::Ls(args) => ls::run(args, session()?),
+        Command::Show(args) => show::run(args, session()?),
+        Command::Labels(args) => labels::run(args, session()?),
+        Command::Export(args) => export::run(args, session()?),
+        Command::Map(args) => map::run(args, session()?),
+        Command::Nearest(args) => nearest::run(args, session()?),
+        Command::Rm(args) => rm::run(args, session()?),
+        Command::Watch(args) => watch::run(args, session()?),
+        Command::Events(args) => events::run(args, session()?),
+        Command::Name(args) => name::run(args, session()?),
+        Command::Collections(args) => collections::run(args, session()?),
+        Command::Synth(args) => synth::run(args, cli.global.json).map(|()| true).map_err(Into::into),
+        Command::Stats => stats::run(session()?),
+        Command::Stop => stop::run(session()?),
+    }?;
+    Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))
+}

@@ -1,8 +1,8 @@
 //! A family and a seed become a folder of labelled meshes.
 
-use crate::mesh::write::off;
-use crate::synth::{Family, LEAST_FACES, Options, UnknownFamily, generate};
 use clap::Args;
+use coseg::mesh::write::off;
+use coseg::synth::{Family, LEAST_FACES, Options, UnknownFamily, generate};
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -14,40 +14,37 @@ const MOST_FACES: i64 = 1_000_000;
 
 /// `coseg synth`: write a family of labelled shapes.
 #[derive(Debug, Clone, Args)]
-pub struct SynthArgs {
+pub(crate) struct SynthArgs {
     /// Which family; `--list` shows them.
     #[arg(required_unless_present = "list", value_parser = parse_family)]
-    pub family: Option<Family>,
+    pub(crate) family: Option<Family>,
     /// How many shapes.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
-    pub count: u32,
+    pub(crate) count: u32,
     /// The same seed gives the same files on every machine.
     #[arg(long, default_value_t = 1)]
-    pub seed: u64,
+    pub(crate) seed: u64,
     /// Faces of each shape.
     #[arg(
         long,
         default_value_t = 6_000,
         value_parser = clap::value_parser!(u32).range(i64::from(LEAST_FACES)..=MOST_FACES)
     )]
-    pub faces: u32,
+    pub(crate) faces: u32,
     /// Turn each shape at random; otherwise +y is up and all face the same way.
     #[arg(long)]
-    pub rotate: bool,
+    pub(crate) rotate: bool,
     /// Where NAME.off, NAME.labels.txt and LABEL_NAMES.txt go; created if missing.
     #[arg(long, required_unless_present = "list")]
-    pub out: Option<PathBuf>,
+    pub(crate) out: Option<PathBuf>,
     /// List the families and their parts.
     #[arg(long)]
-    pub list: bool,
-    /// Print JSON.
-    #[arg(long)]
-    pub json: bool,
+    pub(crate) list: bool,
 }
 
 /// Why the shapes could not be written.
 #[derive(Debug, thiserror::Error)]
-pub enum SynthError {
+pub(crate) enum SynthError {
     /// Both a family and a folder are needed.
     #[error("{0} is missing (without --list, a family and --out are needed)")]
     Missing(&'static str),
@@ -69,11 +66,11 @@ fn parse_family(name: &str) -> Result<Family, UnknownFamily> {
 }
 
 /// Writes the shapes, or lists the families, and prints what was done.
-pub fn run(args: &SynthArgs) -> Result<(), SynthError> {
+pub(crate) fn run(args: &SynthArgs, json: bool) -> Result<(), SynthError> {
     let text = if args.list {
-        list(args.json)
+        list(json)
     } else {
-        write_family(args)?
+        write_family(args, json)?
     };
     std::io::stdout()
         .lock()
@@ -104,7 +101,7 @@ fn list(as_json: bool) -> String {
     text
 }
 
-fn write_family(args: &SynthArgs) -> Result<String, SynthError> {
+fn write_family(args: &SynthArgs, as_json: bool) -> Result<String, SynthError> {
     let family = args.family.ok_or(SynthError::Missing("the family"))?;
     let out = args.out.as_deref().ok_or(SynthError::Missing("--out"))?;
     std::fs::create_dir_all(out).map_err(|source| SynthError::Write {
@@ -136,7 +133,7 @@ fn write_family(args: &SynthArgs) -> Result<String, SynthError> {
         .map(|n| format!("{n}\n"))
         .collect();
     write(&out.join("LABEL_NAMES.txt"), &names)?;
-    if args.json {
+    if as_json {
         let report = json!({
             "family": family.name(),
             "seed": args.seed,
@@ -185,7 +182,7 @@ mod tests {
             "--out",
             out.to_str().unwrap(),
         ];
-        let report = write_family(&Cli::try_parse_from(typed).unwrap().synth).unwrap();
+        let report = write_family(&Cli::try_parse_from(typed).unwrap().synth, false).unwrap();
         assert!(report.starts_with("2 shapes of family pliers (3 parts) in "));
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .unwrap()

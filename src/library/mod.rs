@@ -1,105 +1,155 @@
 //! The library: collections of shapes on disk, in process. The daemon is a shell around it.
 //!
-//! Every method that changes something returns after the change is durable.
+//! Every method that changes something returns after the change is durable. Shapes are submitted (their bytes
+//! become durable), described (pure, on any thread) and placed (one after the other within a collection):
+//! [`Library::add`] does all three.
+//!
+//! ```
+//! use coseg::library::{CollectionSpec, NewShape};
+//! use coseg::{Library, mesh::Format};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let folder = tempfile::tempdir()?;
+//! let library = Library::open(folder.path())?;
+//! let spec = CollectionSpec { name: "boxes".into(), n_parts: Some(2), ..Default::default() };
+//! library.create_collection(&spec, None)?;
+//! let cube = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n\
+//!             f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n";
+//! let shape = NewShape {
+//!     name: "cube".into(),
+//!     bytes: cube.into(),
+//!     format: Format::Obj,
+//!     replace: false,
+//! };
+//! library.add("boxes", shape)?;
+//! let labels = library.labels("boxes", "cube", None)?;
+//! assert_eq!(labels.labels.len(), 6); // one for each face of the file, in its order
+//! # Ok(())
+//! # }
+//! ```
 
+mod collections;
+mod commit;
+mod error;
+mod lane;
+mod learnt;
+mod place;
+mod read;
+mod relabel;
+mod rows;
+mod submit;
 mod types;
+
+pub use error::LibraryError;
+pub use place::{MAX_MAPS, MAX_REPRESENTATIVES};
+pub use rows::report_to_json;
 pub use types::{
-    CollectionInfo, CollectionSpec, Event, EventKind, Failure, ItemState, Job, JobItem, LabelId, LabelInfo,
-    LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome, PartInfo, PartMatch, Placed, RequestKey,
-    ShapeInfo, Source, Up,
+    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job, JobItem,
+    LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome, PartInfo, PartMatch,
+    Placed, RequestKey, ShapeInfo, Source, Up,
 };
 
 use crate::pipeline::Description;
 use crate::store::check::Finding;
-use crate::store::mapped::MappedDescription;
+use crate::store::{CollectionId, CollectionRow, Digest, Store};
+use lane::Lane;
+use std::collections::HashMap;
 use std::path::Path;
-
-/// Why an operation on the library failed.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)]
-pub enum LibraryError {
-    /// Names what is wrong and the limit. `reason` is stable: `BAD_NAME`, `N_PARTS_RANGE`, ...
-    #[error("{message}")]
-    InvalidArgument { reason: &'static str, message: String },
-    #[error("no {what} named {name:?}")]
-    NotFound { what: &'static str, name: String },
-    #[error("{message}")]
-    AlreadyExists { reason: &'static str, message: String },
-    #[error("{message}")]
-    FailedPrecondition { reason: &'static str, message: String },
-    /// The store is damaged at the place named.
-    #[error("{message}")]
-    DataLoss { message: String },
-    #[error(transparent)]
-    Store(#[from] crate::store::StoreError),
-}
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 type Result<T> = std::result::Result<T, LibraryError>;
 
 /// An open library. One process at a time holds it (a lock file says so).
-pub struct Library {}
-
-#[allow(missing_docs, unused_variables, clippy::missing_errors_doc)]
-impl Library {
-    /// Opens the library in `dir`, which is created if it is missing.
-    pub fn open(dir: &Path) -> Result<Self> { unimplemented!() }
-
-    // --- collections
-    pub fn create_collection(&self, spec: &CollectionSpec, key: Option<&RequestKey>) -> Result<CollectionInfo> { unimplemented!() }
-    pub fn collections(&self) -> Result<Vec<CollectionInfo>> { unimplemented!() }
-    pub fn collection(&self, name: &str) -> Result<CollectionInfo> { unimplemented!() }
-    pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> { unimplemented!() }
-    pub fn name_label(&self, collection: &str, label: LabelId, name: &str, key: Option<&RequestKey>) -> Result<LabelInfo> { unimplemented!() }
-
-    // --- adding: submit (durable), then describe (pure, any thread), then place (serial per collection)
-    /// Stores the bytes and a job; the same key gives the same job again.
-    pub fn submit(&self, collection: &str, shapes: Vec<NewShape>, key: Option<&RequestKey>) -> Result<Job> { unimplemented!() }
-    pub fn job(&self, id: u64) -> Result<Job> { unimplemented!() }
-    /// Items not yet done, in order of acceptance: what a daemon takes up again when it starts.
-    pub fn queued_items(&self) -> Result<Vec<JobItem>> { unimplemented!() }
-    /// Marks the items of a job that have not begun as cancelled.
-    pub fn cancel(&self, job: u64) -> Result<Job> { unimplemented!() }
-    /// The pure stage. `stage` is told each stage's name as it begins; returning false stops the work.
-    pub fn describe_item(&self, item: &JobItem, stage: &dyn Fn(&str) -> bool) -> std::result::Result<Described, Failure> { unimplemented!() }
-    /// Places and commits. Must be called in the order of acceptance within a collection.
-    pub fn place_item(&self, item: &JobItem, described: std::result::Result<Described, Failure>) -> Result<ItemState> { unimplemented!() }
-    /// Submit, describe and place in one call, for in-process use.
-    pub fn add(&self, collection: &str, shape: NewShape) -> Result<Placed> { unimplemented!() }
-    /// Recomputes the labels of one stale shape of the collection, or of any if `None`. False: none was stale.
-    pub fn relabel_next(&self, collection: Option<&str>) -> Result<bool> { unimplemented!() }
-
-    // --- reading
-    /// Shapes by ordinal, after `after_ordinal`, at most `limit`; with `label`, only those that carry it.
-    pub fn shapes(&self, collection: &str, after_ordinal: u64, limit: usize, label: Option<LabelId>) -> Result<Vec<ShapeInfo>> { unimplemented!() }
-    pub fn shape(&self, collection: &str, shape: &str) -> Result<ShapeInfo> { unimplemented!() }
-    /// The newest labels, or those of `version`.
-    pub fn labels(&self, collection: &str, shape: &str, version: Option<u64>) -> Result<Labels> { unimplemented!() }
-    /// The bytes as they were sent, and their format.
-    pub fn original(&self, collection: &str, shape: &str) -> Result<(Vec<u8>, crate::mesh::Format)> { unimplemented!() }
-    /// Eigenvalues, eigenvectors, HKS, descriptors: mapped, not copied.
-    pub fn description(&self, collection: &str, shape: &str) -> Result<MappedDescription> { unimplemented!() }
-    pub fn map(&self, collection: &str, from: &str, to: &str) -> Result<MapInfo> { unimplemented!() }
-    pub fn part_correspondence(&self, collection: &str, a: &str, b: &str) -> Result<(Vec<PartMatch>, crate::fmap::Quality)> { unimplemented!() }
-    /// The `limit` nearest shapes with their distances, nearest first.
-    pub fn nearest(&self, collection: &str, shape: &str, limit: usize) -> Result<Vec<(String, f64)>> { unimplemented!() }
-    /// Every shape's name, version and the collection's sequence, as of one moment.
-    pub fn labels_snapshot(&self, collection: &str) -> Result<(u64, Vec<(String, Labels)>)> { unimplemented!() }
-    pub fn events_since(&self, collection: &str, sequence: u64, limit: usize) -> Result<Vec<Event>> { unimplemented!() }
-    pub fn stats(&self) -> Result<LibraryStats> { unimplemented!() }
-
-    // --- removing
-    pub fn remove(&self, collection: &str, shape: &str, key: Option<&RequestKey>) -> Result<()> { unimplemented!() }
-
-    // --- care
-    /// Verifies everything on disk against the catalog.
-    pub fn check(dir: &Path) -> Result<Vec<Finding>> { unimplemented!() }
+pub struct Library {
+    store: Store,
+    lanes: Mutex<HashMap<CollectionId, Arc<Mutex<Option<Lane>>>>>,
+    /// Stage of the items that are being described, by job and index.
+    running: Mutex<HashMap<(u64, u32), String>>,
+    max_maps: AtomicU64,
+    max_relabelled: AtomicU64,
 }
 
-/// A description with the milliseconds each stage took.
+/// A description with what the library needs to commit it.
 #[derive(Debug, Clone)]
 pub struct Described {
     /// What was computed.
     pub description: Description,
     /// Stage and milliseconds, in order.
     pub stages_ms: Vec<(String, f64)>,
+    digest: Digest,
+    params_json: String,
+}
+
+impl Library {
+    /// Opens the library in `dir`, which is created if it is missing.
+    ///
+    /// # Errors
+    /// The folder is held by another process, cannot be written, or is of a newer format.
+    pub fn open(dir: &Path) -> Result<Self> {
+        Ok(Self {
+            store: Store::open(dir)?,
+            lanes: Mutex::default(),
+            running: Mutex::default(),
+            max_maps: AtomicU64::new(0),
+            max_relabelled: AtomicU64::new(0),
+        })
+    }
+
+    /// Verifies everything on disk against the catalog, of a library that no process holds.
+    ///
+    /// # Errors
+    /// There is no library in `dir`, or it is held or unreadable.
+    pub fn check(dir: &Path) -> Result<Vec<Finding>> {
+        Ok(crate::store::check::check(dir)?)
+    }
+
+    /// The store, for care: its health and the sweep of orphans.
+    pub fn store(&self) -> &Store {
+        &self.store
+    }
+
+    /// Runs `work` on the lane of a collection, alone. After an error the lane is read anew, so that it cannot
+    /// differ from the catalog.
+    fn with_lane<T>(
+        &self,
+        row: CollectionRow,
+        work: impl FnOnce(&mut Lane) -> Result<T>,
+    ) -> Result<T> {
+        let slot = Arc::clone(
+            self.lanes.lock().unwrap_or_else(PoisonError::into_inner).entry(row.id).or_default(),
+        );
+        let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut lane = match slot.take() {
+            Some(lane) => lane,
+            None => self.store.catalog().read(|r| Lane::load(r, row))?,
+        };
+        let done = work(&mut lane)?;
+        *slot = Some(lane);
+        Ok(done)
+    }
+
+    fn collection_row(&self, name: &str) -> Result<CollectionRow> {
+        let row = self.store.catalog().read(|r| r.collection(name).map_err(LibraryError::from))?;
+        row.ok_or_else(|| LibraryError::NotFound { what: "collection", name: name.into() })
+    }
+
+    fn note(&self, placed: &Placed) {
+        self.max_maps.fetch_max(placed.n_maps.into(), Ordering::Relaxed);
+        self.max_relabelled.fetch_max(placed.n_relabelled.into(), Ordering::Relaxed);
+    }
+
+    /// The bytes of a mesh file by their digest.
+    fn original_bytes(&self, digest: &Digest) -> Result<Vec<u8>> {
+        Ok(self.store.objects().original(&self.object(crate::store::ObjectKind::Original, digest)?)?)
+    }
+
+    fn object(
+        &self,
+        kind: crate::store::ObjectKind,
+        digest: &Digest,
+    ) -> Result<crate::store::ObjectRow> {
+        let row = self.store.catalog().read(|r| r.object(kind, digest).map_err(LibraryError::from))?;
+        row.ok_or_else(|| rows::damaged("objects", &format!("no row for {digest}")))
+    }
 }

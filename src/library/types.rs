@@ -23,6 +23,42 @@ pub enum Up {
     Auto,
 }
 
+impl Up {
+    const NAMES: [(Self, &'static str); 8] = [
+        (Self::PlusX, "+x"),
+        (Self::MinusX, "-x"),
+        (Self::PlusY, "+y"),
+        (Self::MinusY, "-y"),
+        (Self::PlusZ, "+z"),
+        (Self::MinusZ, "-z"),
+        (Self::Unknown, "unknown"),
+        (Self::Auto, "auto"),
+    ];
+
+    /// Unit vector in input coordinates; `None` where the axis is not given.
+    pub fn axis(self) -> Option<[f64; 3]> {
+        let at = Self::NAMES.iter().position(|n| n.0 == self).filter(|i| *i < 6)?;
+        let mut axis = [0.0; 3];
+        axis[at / 2] = if at.is_multiple_of(2) { 1.0 } else { -1.0 };
+        Some(axis)
+    }
+}
+
+impl std::fmt::Display for Up {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(Self::NAMES.iter().find(|n| n.0 == *self).map_or("unknown", |n| n.1))
+    }
+}
+
+impl std::str::FromStr for Up {
+    type Err = String;
+
+    fn from_str(s: &str) -> Result<Self, String> {
+        let found = Self::NAMES.iter().find(|n| n.1.eq_ignore_ascii_case(s));
+        found.map(|n| n.0).ok_or_else(|| format!("up is {s:?}, but must be one of +x -x +y -y +z -z unknown auto"))
+    }
+}
+
 /// What a collection is created with.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct CollectionSpec {
@@ -116,7 +152,7 @@ pub struct ShapeInfo {
 }
 
 /// A connected piece of one shape with one label.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PartInfo {
     /// Its label.
     pub label: LabelId,
@@ -172,6 +208,20 @@ pub struct Failure {
     pub reason: String,
     /// For people: the value and the limit.
     pub message: String,
+    /// Where in the input, if it is one place.
+    #[serde(default)]
+    pub subject: Option<FailureSubject>,
+}
+
+/// A place in the input of a shape that was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum FailureSubject {
+    /// A face (polygon), from 0.
+    Face(u64),
+    /// A vertex, from 0.
+    Vertex(u64),
+    /// A line of the file, from 1.
+    Line(u64),
 }
 
 /// One shape of a job.
@@ -241,6 +291,8 @@ pub struct Event {
 pub enum EventKind {
     /// The collection was created.
     CollectionCreated,
+    /// The collection was deleted with its shapes.
+    CollectionDeleted,
     /// A shape is there, labelled.
     ShapeAdded {
         /// Its name.

@@ -1,2 +1,11 @@
-//! (being written)
+//! Numerical tools that know nothing of meshes.
+
 pub mod assignment;
+pub mod block_lanczos;
+pub mod dense_eigen;
+pub mod kmeans;
+pub mod lanczos_top;
+pub mod ldlt;
+pub mod maxflow;
+pub mod nearest;
+pub mod panel;

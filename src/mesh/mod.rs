@@ -1,4 +1,31 @@
 //! Bytes of a mesh file become a clean, normalised triangle mesh at working resolution.
+//!
+//! [`parse`] reads what the file says, [`clean`] makes it a mesh that can be measured and reports what
+//! it did, [`proxy`] brings it to working resolution with a map back, [`bridges`] joins its components,
+//! and [`adjacency`] and [`geodesic`] hold the graphs that everything later walks on.
+
+pub mod adjacency;
+mod bridges;
+mod bvh;
+mod clean;
+pub mod geodesic;
+mod orient;
+mod parse;
+mod proxy;
+mod refine;
+mod report;
+mod vector;
+#[cfg(test)]
+pub(crate) mod zoo;
+
+pub use adjacency::{DualEdge, DualGraph, FaceGeometry};
+pub use bridges::bridges;
+pub use bvh::Bvh;
+pub use clean::{CleanError, Cleaned, clean};
+pub use geodesic::EdgeGraph;
+pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, parse};
+pub use proxy::{Proxy, proxy};
+pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 
 pub mod write;
 
@@ -11,6 +38,14 @@ pub struct TriMesh {
     pub faces: Vec<[u32; 3]>,
 }
 
+impl TriMesh {
+    /// Corners of a face.
+    #[inline]
+    pub fn corners(&self, face: usize) -> [[f64; 3]; 3] {
+        self.faces[face].map(|v| self.vertices[v as usize])
+    }
+}
+
 /// Mesh file formats that can be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
@@ -20,10 +55,28 @@ pub enum Format {
     Off,
 }
 
+impl Format {
+    /// The format a file name's extension says, in any case; `None` for any other extension.
+    pub fn from_name(file_name: &str) -> Option<Self> {
+        let (stem, extension) = file_name.rsplit_once('.')?;
+        if stem.is_empty() {
+            return None;
+        }
+        match extension.to_ascii_lowercase().as_str() {
+            "obj" => Some(Self::Obj),
+            "off" => Some(Self::Off),
+            _ => None,
+        }
+    }
+}
+
 /// What a file holds: `polygons` triangulated as fans, in file order.
+///
+/// Every polygon has at least one triangle: a face with one or two corners becomes a degenerate one, so
+/// that polygons keep their numbers.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParsedMesh {
-    /// Coordinates as in the file.
+    /// Coordinates as in the file, in file order.
     pub vertices: Vec<[f64; 3]>,
     /// Triangles, as vertex indices that are all in range.
     pub triangles: Vec<[u32; 3]>,
@@ -36,7 +89,7 @@ pub struct ParsedMesh {
 /// A short virtual edge that joins two components, so that the analysis has one connected domain.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bridge {
-    /// Vertices on either side.
+    /// Vertices on either side; the same vertex twice where two components touch in a point.
     pub vertices: [u32; 2],
     /// Faces on either side, incident to those vertices.
     pub faces: [u32; 2],
@@ -61,11 +114,13 @@ pub struct CleanReport {
     pub n_degenerate_triangles: usize,
     /// Triangles dropped because another one has the same three corners.
     pub n_duplicate_triangles: usize,
+    /// Triangles turned over, so that neighbours agree on which side is outside.
+    pub n_flipped_triangles: usize,
     /// Edges with more than two faces.
     pub n_nonmanifold_edges: usize,
     /// Edges with one face.
     pub n_boundary_edges: usize,
-    /// Connected components of the cleaned mesh.
+    /// Connected components of the cleaned mesh (connected through shared edges).
     pub n_components: usize,
     /// Faces of the proxy.
     pub n_proxy_faces: usize,

@@ -1,1 +1,9 @@
-//! (being written)
+//! One shape's faces become patches and parts, before anything is known of other shapes.
+
+mod parts;
+mod patches;
+mod surface;
+
+pub use parts::{PartGraph, merge_patches};
+pub use patches::patches;
+pub use surface::{PatchGraph, Surface, SurfaceEdge};

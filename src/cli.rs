@@ -1,0 +1,446 @@
+//! What was typed becomes one command with typed flags.
+
+use crate::commands::describe::Describe;
+use crate::commands::synth::SynthArgs;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use coseg::ipc::wire;
+use coseg::operators;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Exit codes, as `coseg --help` tells them.
+pub(crate) mod exit {
+    /// Something failed: a shape was refused, what was named is not there, a check found damage.
+    pub(crate) const FAILED: u8 = 1;
+    /// The command line or the configuration is wrong; clap uses the same.
+    pub(crate) const USAGE: u8 = 2;
+    /// No answer from a daemon within the timeout.
+    pub(crate) const NO_ANSWER: u8 = 3;
+}
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0  done
+  1  failed: a shape was refused, what was named is not there, a check found damage
+  2  the command line or the configuration is wrong
+  3  no answer from a daemon within --timeout
+
+Data goes to stdout, words to stderr. Settings of the daemon: coseg config show.";
+
+/// Keeps a growing library of 3D shapes consistently segmented and labelled.
+#[derive(Debug, Parser)]
+#[command(name = "coseg", version, after_help = EXIT_CODES, arg_required_else_help = true)]
+pub(crate) struct Cli {
+    #[command(flatten)]
+    pub(crate) global: Global,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// Flags of every command.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct Global {
+    /// Where the daemon is: ipc://PATH or tcp://HOST:PORT [default: the daemon's own default socket]
+    #[arg(long, global = true, env = "COSEG_ENDPOINT", value_name = "URI", hide_env_values = true)]
+    pub(crate) endpoint: Option<String>,
+    /// Seconds to wait for an answer; work that goes on is waited for all the same
+    #[arg(long, global = true, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
+    pub(crate) timeout: Duration,
+    /// Print JSON, and nothing else, on stdout
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| format!("{text:?} is not a number of seconds"))?;
+    match Duration::try_from_secs_f64(seconds) {
+        Ok(duration) if !duration.is_zero() && seconds <= 86_400.0 => Ok(duration),
+        _ => Err(format!("{seconds} s is not between 0 and 86400")),
+    }
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Run the daemon
+    Serve(Serve),
+    /// Add meshes, and wait until they are labelled
+    Add(Add),
+    /// Wait until a collection has nothing left to do
+    Wait(InCollection),
+    /// List collections, or the shapes of one
+    Ls(Ls),
+    /// Show one shape, or the collection
+    Show(Show),
+    /// Print a shape's labels, one for each face of its file
+    Labels(Labels),
+    /// Write labels, or coloured meshes, of a collection to a folder
+    Export(Export),
+    /// Show the functional map from one shape to another and which parts it matches
+    Map(Map),
+    /// List the shapes most like one shape
+    Nearest(Nearest),
+    /// Remove shapes
+    Rm(Rm),
+    /// Follow events as they happen
+    Watch(Watch),
+    /// List events of a collection's log
+    Events(Events),
+    /// Give a label a name
+    Name(Name),
+    /// Create or delete collections
+    #[command(subcommand)]
+    Collections(Collections),
+    /// Show counters of the daemon
+    Stats,
+    /// Let the daemon finish what it is at and stop
+    Stop,
+    /// Compute the spectrum and descriptors of one mesh, without a daemon
+    Describe(Describe),
+    /// Make a family of labelled shapes
+    Synth(SynthArgs),
+    /// Verify a library's files against its catalog, without a daemon
+    Check(Check),
+    /// Check or show the daemon's configuration
+    #[command(subcommand)]
+    Config(ConfigCommand),
+}
+
+/// `coseg serve`
+#[derive(Debug, Args)]
+pub(crate) struct Serve {
+    /// Folder of the library, created if missing [default: as `coseg config show` says]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) library: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) file: ConfigFile,
+    /// Threads that describe shapes; 0: one for each processor
+    #[arg(long, value_name = "N")]
+    pub(crate) workers: Option<usize>,
+    /// error, warn, info, debug or trace
+    #[arg(long, value_name = "LEVEL")]
+    pub(crate) log_level: Option<String>,
+}
+
+/// Which configuration file.
+#[derive(Debug, Args)]
+pub(crate) struct ConfigFile {
+    /// Configuration file [default: /etc/coseg/coseg.toml if it exists]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+}
+
+/// Which collection.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct InCollection {
+    /// The collection; may be left out if there is only one
+    #[arg(long, short, value_name = "NAME")]
+    pub(crate) collection: Option<String>,
+}
+
+/// Settings of a collection; those not given take their defaults, or are as they are.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct Settings {
+    /// Number of part kinds; 0: estimated [default: estimated]
+    #[arg(long, value_name = "N")]
+    pub(crate) parts: Option<u32>,
+    /// The axis that points up in every file: +x -x +y -y +z -z unknown auto [default: unknown]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+    pub(crate) up: Option<wire::Up>,
+    /// Which Laplacian [default: tufted]
+    #[arg(long, value_name = "OPERATOR")]
+    pub(crate) operator: Option<Operator>,
+    /// Faces of the working resolution [default: the daemon's]
+    #[arg(long, value_name = "N")]
+    pub(crate) working_faces: Option<u32>,
+}
+
+impl Settings {
+    /// As a collection's specification, in which nothing that was not given is set.
+    pub(crate) fn to_spec(&self, name: &str) -> wire::CollectionSpec {
+        wire::CollectionSpec {
+            name: name.to_owned(),
+            n_parts: self.parts,
+            up: self.up.unwrap_or(wire::Up::Unspecified).into(),
+            operator: self.operator.map_or(wire::Operator::Unspecified, Operator::to_wire).into(),
+            working_faces: self.working_faces.unwrap_or(0),
+        }
+    }
+}
+
+fn up(text: &str) -> Result<wire::Up, String> {
+    Ok(match text.to_ascii_lowercase().as_str() {
+        "+x" | "x" => wire::Up::PlusX,
+        "-x" => wire::Up::MinusX,
+        "+y" | "y" => wire::Up::PlusY,
+        "-y" => wire::Up::MinusY,
+        "+z" | "z" => wire::Up::PlusZ,
+        "-z" => wire::Up::MinusZ,
+        "unknown" => wire::Up::Unknown,
+        "auto" => wire::Up::Auto,
+        _ => return Err("expected one of +x -x +y -y +z -z unknown auto".to_owned()),
+    })
+}
+
+/// A Laplacian.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum Operator {
+    /// Intrinsic Delaunay on the tufted cover
+    Tufted,
+    /// Plain cotangents
+    Cotan,
+    /// Belkin, Sun and Wang 2008
+    MeshLaplace,
+}
+
+impl Operator {
+    /// As it is typed.
+    pub(crate) fn name(operator: operators::Operator) -> &'static str {
+        match operator {
+            operators::Operator::Tufted => "tufted",
+            operators::Operator::Cotan => "cotan",
+            operators::Operator::MeshLaplace => "mesh-laplace",
+        }
+    }
+
+    pub(crate) fn to_domain(self) -> operators::Operator {
+        match self {
+            Self::Tufted => operators::Operator::Tufted,
+            Self::Cotan => operators::Operator::Cotan,
+            Self::MeshLaplace => operators::Operator::MeshLaplace,
+        }
+    }
+
+    fn to_wire(self) -> wire::Operator {
+        match self {
+            Self::Tufted => wire::Operator::Tufted,
+            Self::Cotan => wire::Operator::Cotan,
+            Self::MeshLaplace => wire::Operator::MeshLaplace,
+        }
+    }
+}
+
+/// `coseg add`
+#[derive(Debug, Args)]
+pub(crate) struct Add {
+    /// Mesh files (.obj, .off), or folders of them; a shape's name is its file's stem
+    #[arg(required = true, value_name = "PATH")]
+    pub(crate) paths: Vec<PathBuf>,
+    /// The collection, created if missing; without it the only one there is, or a new one named default
+    #[arg(long, short, value_name = "NAME")]
+    pub(crate) collection: Option<String>,
+    #[command(flatten)]
+    pub(crate) settings: Settings,
+    /// Replace shapes of the same name that have other bytes
+    #[arg(long)]
+    pub(crate) replace: bool,
+    /// Return when the shapes are accepted, not when they are labelled
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg ls`
+#[derive(Debug, Args)]
+pub(crate) struct Ls {
+    /// List the shapes of this collection
+    #[arg(long, short, value_name = "NAME")]
+    pub(crate) collection: Option<String>,
+    /// Only shapes that carry this label
+    #[arg(long, value_name = "ID", requires = "collection")]
+    pub(crate) label: Option<u32>,
+}
+
+/// `coseg show`
+#[derive(Debug, Args)]
+pub(crate) struct Show {
+    /// The shape; without it the collection is shown
+    pub(crate) shape: Option<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+}
+
+/// `coseg labels`
+#[derive(Debug, Args)]
+pub(crate) struct Labels {
+    /// The shape
+    pub(crate) shape: String,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// An earlier version of the labels
+    #[arg(long, value_name = "N")]
+    pub(crate) version: Option<u64>,
+    /// Print the probability of each label beside it
+    #[arg(long)]
+    pub(crate) confidence: bool,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg export`
+#[derive(Debug, Args)]
+pub(crate) struct Export {
+    /// Shapes to export [default: all]
+    pub(crate) shapes: Vec<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// What to write for each shape
+    #[arg(long, value_name = "FORMAT")]
+    pub(crate) format: ExportFormat,
+    /// Folder to write to, created if missing
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// What `coseg export` writes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ExportFormat {
+    /// NAME.labels.txt: a label for each face of the file, one a line; -1: unlabelled
+    Labels,
+    /// NAME.ply: the mesh with a colour and an int label for each face
+    Ply,
+    /// NAME.obj and labels.mtl: the mesh with a group and a material for each label
+    Obj,
+}
+
+/// `coseg map`
+#[derive(Debug, Args)]
+pub(crate) struct Map {
+    /// Functions are carried from this shape
+    pub(crate) from: String,
+    /// Functions are carried to this shape
+    pub(crate) to: String,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Write c_12 and p2p_21 to this safetensors file
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+/// `coseg nearest`
+#[derive(Debug, Args)]
+pub(crate) struct Nearest {
+    /// The shape
+    pub(crate) shape: String,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// At most this many
+    #[arg(long, short = 'n', value_name = "N", default_value_t = 5)]
+    pub(crate) limit: u32,
+}
+
+/// `coseg rm`
+#[derive(Debug, Args)]
+pub(crate) struct Rm {
+    /// The shapes
+    #[arg(required = true)]
+    pub(crate) shapes: Vec<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+}
+
+/// `coseg watch`
+#[derive(Debug, Args)]
+pub(crate) struct Watch {
+    /// Only this collection
+    #[arg(long, short, value_name = "NAME")]
+    pub(crate) collection: Option<String>,
+    /// Begin with the events after this number [default: with the next one]
+    #[arg(long, value_name = "SEQUENCE", requires = "collection")]
+    pub(crate) since: Option<u64>,
+    /// End after this many events
+    #[arg(long, short = 'n', value_name = "N")]
+    pub(crate) limit: Option<u64>,
+}
+
+/// `coseg events`
+#[derive(Debug, Args)]
+pub(crate) struct Events {
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Events after this number
+    #[arg(long, value_name = "SEQUENCE", default_value_t = 0)]
+    pub(crate) since: u64,
+    /// At most this many
+    #[arg(long, short = 'n', value_name = "N")]
+    pub(crate) limit: Option<u64>,
+}
+
+/// `coseg name`
+#[derive(Debug, Args)]
+pub(crate) struct Name {
+    /// The label's id
+    pub(crate) label: u32,
+    /// Its name
+    pub(crate) name: String,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+}
+
+/// `coseg collections`
+#[derive(Debug, Subcommand)]
+pub(crate) enum Collections {
+    /// Create a collection
+    Create {
+        /// Its name
+        name: String,
+        #[command(flatten)]
+        settings: Settings,
+    },
+    /// Delete a collection with its shapes and labels
+    Delete {
+        /// Its name
+        name: String,
+    },
+}
+
+/// `coseg check`
+#[derive(Debug, Args)]
+pub(crate) struct Check {
+    /// Folder of the library [default: as `coseg config show` says]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) library: Option<PathBuf>,
+}
+
+/// `coseg config`
+#[derive(Debug, Subcommand)]
+pub(crate) enum ConfigCommand {
+    /// Say whether the daemon would start with it
+    Check(ConfigFile),
+    /// Print what the daemon would use
+    Show(ConfigFile),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Cli;
+    use clap::{CommandFactory as _, Parser as _};
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn global_flags_may_follow_the_subcommand() {
+        let line = ["coseg", "ls", "--endpoint", "ipc:///x", "--json", "--timeout", "0.5"];
+        let cli = Cli::try_parse_from(line).unwrap();
+        assert_eq!(cli.global.endpoint.as_deref(), Some("ipc:///x"));
+        assert!(cli.global.json);
+        assert_eq!(cli.global.timeout.as_millis(), 500);
+    }
+
+    #[test]
+    fn axes_are_read_with_their_sign() {
+        for axis in ["+y", "-z", "unknown", "auto"] {
+            for line in [vec!["coseg", "add", "x.off", "--up", axis]] {
+                assert!(Cli::try_parse_from(line).is_ok(), "{axis}");
+            }
+        }
+        assert!(Cli::try_parse_from(["coseg", "add", "x.off", "--up", "w"]).is_err());
+        assert!(Cli::try_parse_from(["coseg", "ls", "--timeout", "0"]).is_err());
+    }
+}

@@ -1,0 +1,226 @@
+//! What the daemon says, as JSON.
+
+use coseg::ipc::wire::{self, event::Kind};
+use serde_json::{Map, Value, json};
+
+/// The name of an enum value without its prefix, in lower case.
+fn short(name: &str, prefix: &str) -> String {
+    name.strip_prefix(prefix).unwrap_or(name).to_ascii_lowercase()
+}
+
+pub(crate) fn up(up: wire::Up) -> &'static str {
+    match up {
+        wire::Up::PlusX => "+x",
+        wire::Up::MinusX => "-x",
+        wire::Up::PlusY => "+y",
+        wire::Up::MinusY => "-y",
+        wire::Up::PlusZ => "+z",
+        wire::Up::MinusZ => "-z",
+        wire::Up::Unspecified | wire::Up::Unknown => "unknown",
+        wire::Up::Auto => "auto",
+    }
+}
+
+pub(crate) fn outcome(outcome: wire::Outcome) -> String {
+    short(outcome.as_str_name(), "OUTCOME_")
+}
+
+/// `#rrggbb`.
+pub(crate) fn colour(rgb: u32) -> String {
+    format!("#{:06x}", rgb & 0xff_ffff)
+}
+
+pub(crate) fn collection(c: &wire::Collection) -> Value {
+    let spec = c.spec.clone().unwrap_or_default();
+    json!({
+        "name": spec.name,
+        "n_parts": spec.n_parts.filter(|&n| n > 0),
+        "up": up(spec.up()),
+        "operator": short(spec.operator().as_str_name(), "OPERATOR_").replace('_', "-"),
+        "working_faces": spec.working_faces,
+        "sequence": c.sequence,
+        "n_shapes": c.n_shapes,
+        "n_stale": c.n_stale,
+        "labels": c.labels.iter().map(label).collect::<Vec<_>>(),
+    })
+}
+
+pub(crate) fn label(l: &wire::LabelInfo) -> Value {
+    json!({
+        "id": l.id,
+        "name": Some(&l.name).filter(|n| !n.is_empty()),
+        "colour": colour(l.colour_rgb),
+        "merged_into": l.merged_into,
+    })
+}
+
+pub(crate) fn shape(s: &wire::Shape) -> Value {
+    let parts = s.parts.iter().map(|p| {
+        json!({ "label": p.label, "area_share": p.area_share, "confidence": p.confidence })
+    });
+    let sources = s.sources.iter().map(|s| {
+        json!({ "shape": s.shape, "version": s.version, "weight": s.weight })
+    });
+    json!({
+        "name": s.name,
+        "ordinal": s.ordinal,
+        "version": s.version,
+        "stale": s.stale,
+        "n_polygons": s.n_polygons,
+        "area": s.area,
+        "content_digest": s.content_digest,
+        "report": s.report.as_ref().map(report),
+        "parts": parts.collect::<Vec<_>>(),
+        "sources": sources.collect::<Vec<_>>(),
+        "stored_bytes": s.stored_bytes,
+    })
+}
+
+fn report(r: &wire::CleanReport) -> Value {
+    json!({
+        "n_polygons": r.n_polygons,
+        "n_triangles": r.n_triangles,
+        "n_vertices": r.n_vertices,
+        "n_welded_vertices": r.n_welded_vertices,
+        "n_isolated_vertices": r.n_isolated_vertices,
+        "n_degenerate_triangles": r.n_degenerate_triangles,
+        "n_duplicate_triangles": r.n_duplicate_triangles,
+        "n_nonmanifold_edges": r.n_nonmanifold_edges,
+        "n_boundary_edges": r.n_boundary_edges,
+        "n_components": r.n_components,
+        "n_proxy_faces": r.n_proxy_faces,
+        "n_proxy_vertices": r.n_proxy_vertices,
+        "n_bridges": r.n_bridges,
+    })
+}
+
+/// One shape of a job; times in milliseconds by stage.
+pub(crate) fn job_item(i: &wire::JobItem) -> Value {
+    let mut value = json!({ "name": i.name, "outcome": short(i.state().as_str_name(), "ITEM_STATE_") });
+    if let Some(p) = &i.placed {
+        value["outcome"] = outcome(p.outcome()).into();
+        value["version"] = p.version.into();
+        value["sequence"] = p.sequence.into();
+        value["n_maps"] = p.n_maps.into();
+        value["n_relabelled"] = p.n_relabelled.into();
+        let stages = p.stages.iter().map(|s| (s.stage.clone(), s.ms.into()));
+        value["stages_ms"] = Value::Object(stages.collect());
+    }
+    if let Some(e) = &i.error {
+        value["error"] = error(e);
+    }
+    value
+}
+
+pub(crate) fn error(e: &wire::Error) -> Value {
+    json!({
+        "code": e.code().as_str_name().trim_start_matches("ERROR_CODE_"),
+        "reason": e.reason().as_str_name().trim_start_matches("ERROR_REASON_"),
+        "message": e.message,
+    })
+}
+
+pub(crate) fn quality(q: &wire::MapQuality) -> Value {
+    json!({
+        "descriptor_residual": q.descriptor_residual,
+        "orthogonality": q.orthogonality,
+        "coverage": q.coverage,
+        "near_zero": q.near_zero,
+    })
+}
+
+pub(crate) fn part_match(m: &wire::PartMatch) -> Value {
+    json!({
+        "part_a": m.part_a,
+        "part_b": m.part_b,
+        "label_a": m.label_a,
+        "label_b": m.label_b,
+        "overlap": m.overlap,
+    })
+}
+
+/// An event, flat: `kind` and what belongs to it beside sequence and collection.
+pub(crate) fn event(e: &wire::Event) -> Value {
+    let (kind, body) = match &e.kind {
+        None => ("unknown", json!({})),
+        Some(Kind::CollectionCreated(_)) => ("collection_created", json!({})),
+        Some(Kind::CollectionDeleted(_)) => ("collection_deleted", json!({})),
+        Some(Kind::ShapeAdded(a)) => {
+            let shares = a.area_shares.iter();
+            let shares =
+                shares.map(|s| json!({ "label": s.label, "area_share": s.area_share }));
+            let shares: Vec<_> = shares.collect();
+            ("shape_added", json!({ "shape": a.shape, "version": a.version, "area_shares": shares }))
+        }
+        Some(Kind::ShapeRemoved(r)) => ("shape_removed", json!({ "shape": r.shape })),
+        Some(Kind::LabelsChanged(c)) => {
+            let moves = c.moves.iter();
+            let moves = moves
+                .map(|m| json!({ "from": m.from, "to": m.to, "area_share": m.area_share }))
+                .collect::<Vec<_>>();
+            let (shape, version, cause) = (&c.shape, c.version, &c.cause);
+            let body =
+                json!({ "shape": shape, "version": version, "cause": cause, "moves": moves });
+            ("labels_changed", body)
+        }
+        Some(Kind::LabelCreated(l)) => ("label_created", json!({ "label": l.label })),
+        Some(Kind::LabelMerged(m)) => {
+            ("label_merged", json!({ "from": m.from, "into": m.into }))
+        }
+        Some(Kind::LabelSplit(s)) => ("label_split", json!({ "from": s.from, "into": s.into })),
+        Some(Kind::LabelNamed(n)) => {
+            ("label_named", json!({ "label": n.label, "name": n.name }))
+        }
+        Some(Kind::Reclustered(r)) => {
+            let body = json!({
+                "score_before": r.score_before,
+                "score_after": r.score_after,
+                "accepted": r.accepted,
+            });
+            ("reclustered", body)
+        }
+        Some(Kind::Heartbeat(_)) => ("heartbeat", json!({})),
+    };
+    let mut value = Map::new();
+    value.insert("sequence".to_owned(), e.sequence.into());
+    value.insert("collection".to_owned(), e.collection.clone().into());
+    value.insert("kind".to_owned(), kind.into());
+    if let Value::Object(body) = body {
+        value.extend(body);
+    }
+    Value::Object(value)
+}
+
+/// An event as one line for people.
+pub(crate) fn event_line(e: &wire::Event) -> String {
+    let percent = |share: f64| format!("{:.0} %", share * 100.0);
+    let body = match &e.kind {
+        None => "unknown event".to_owned(),
+        Some(Kind::CollectionCreated(_)) => "collection created".to_owned(),
+        Some(Kind::CollectionDeleted(_)) => "collection deleted".to_owned(),
+        Some(Kind::ShapeAdded(a)) => {
+            let shares = a.area_shares.iter();
+            let shares: Vec<_> =
+                shares.map(|s| format!("{}: {}", s.label, percent(s.area_share))).collect();
+            format!("{} added, version {}, labels {}", a.shape, a.version, shares.join(", "))
+        }
+        Some(Kind::ShapeRemoved(r)) => format!("{} removed", r.shape),
+        Some(Kind::LabelsChanged(c)) => {
+            let moves = c.moves.iter();
+            let moves: Vec<_> = moves
+                .map(|m| format!("{} to {}: {}", m.from, m.to, percent(m.area_share)))
+                .collect();
+            format!("{} relabelled ({}), version {}, {}", c.shape, c.cause, c.version, moves.join(", "))
+        }
+        Some(Kind::LabelCreated(l)) => format!("label {} created", l.label),
+        Some(Kind::LabelMerged(m)) => format!("label {} merged into {}", m.from, m.into),
+        Some(Kind::LabelSplit(s)) => format!("label {} split into {:?}", s.from, s.into),
+        Some(Kind::LabelNamed(n)) => format!("label {} named {:?}", n.label, n.name),
+        Some(Kind::Reclustered(r)) => {
+            let taken = if r.accepted { "taken" } else { "not taken" };
+            format!("reclustered, score {:.3} to {:.3}, {taken}", r.score_before, r.score_after)
+        }
+        Some(Kind::Heartbeat(_)) => "heartbeat".to_owned(),
+    };
+    format!("{} {} {body}", e.collection, e.sequence)
+}

@@ -1,0 +1,92 @@
+//! `coseg map`: the functional map from one shape to another, and which parts it matches.
+
+use super::session::{Session, table};
+use super::{CommandError, Outcome, json};
+use crate::cli::Map;
+use coseg::call;
+use coseg::ipc::wire::{self, ArrayRef, DataType};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+use serde_json::json;
+use std::path::Path;
+
+pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
+    let collection = session.collection(&args.within)?;
+    let request = wire::GetFunctionalMapRequest {
+        collection: collection.clone(),
+        from: args.from.clone(),
+        to: args.to.clone(),
+    };
+    let (map, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
+    let request = wire::GetPartCorrespondenceRequest {
+        collection,
+        shape_a: args.from.clone(),
+        shape_b: args.to.clone(),
+    };
+    let parts = call!(session.client, GetPartCorrespondence(request))?;
+    if let Some(path) = &args.out {
+        write_arrays(path, &[("c_12", &map.c_12), ("p2p_21", &map.p2p_21)], &frames)?;
+    }
+    let shape = map.c_12.as_ref().map(|c| c.shape.clone()).unwrap_or_default();
+    let quality = map.quality.unwrap_or_default();
+    if session.json {
+        let matches: Vec<_> = parts.matches.iter().map(json::part_match).collect();
+        session.print_json(&json!({
+            "from": args.from,
+            "to": args.to,
+            "c_12_shape": shape,
+            "quality": json::quality(&quality),
+            "matches": matches,
+        }))?;
+        return Ok(true);
+    }
+    let size: Vec<String> = shape.iter().map(u64::to_string).collect();
+    session.line(&format!(
+        "{} to {}: c_12 ({}), descriptor residual {:.3}, orthogonality {:.3}, coverage {:.2}, near zero {:.2}",
+        args.from,
+        args.to,
+        size.join(", "),
+        quality.descriptor_residual,
+        quality.orthogonality,
+        quality.coverage,
+        quality.near_zero
+    ))?;
+    let (from, to) = (format!("part of {}", args.from), format!("part of {}", args.to));
+    let mut rows = vec![vec![from, "label".to_owned(), to, "label".to_owned(), "overlap".to_owned()]];
+    rows.extend(parts.matches.iter().map(|m| {
+        vec![
+            m.part_a.to_string(),
+            m.label_a.to_string(),
+            m.part_b.to_string(),
+            m.label_b.to_string(),
+            format!("{:.2}", m.overlap),
+        ]
+    }));
+    session.line(&table(&rows))?;
+    Ok(true)
+}
+
+/// Writes arrays as they came: frames and safetensors are both little-endian and row-major.
+fn write_arrays(
+    path: &Path,
+    arrays: &[(&str, &Option<ArrayRef>)],
+    frames: &[bytes::Bytes],
+) -> Result<(), CommandError> {
+    let bad = |e: String| CommandError::Failed(format!("{}: {e}", path.display()));
+    let mut tensors = Vec::new();
+    for (name, array) in arrays {
+        let Some(array) = array else { continue };
+        let dtype = match array.dtype() {
+            DataType::Int32 => Dtype::I32,
+            DataType::Uint32 => Dtype::U32,
+            DataType::Float32 => Dtype::F32,
+            DataType::Float64 => Dtype::F64,
+            DataType::Unspecified => return Err(bad(format!("{name} has no element type"))),
+        };
+        let frame = frames.get(array.frame as usize).map(AsRef::as_ref).unwrap_or_default();
+        let shape = array.shape.iter().map(|&n| n as usize).collect();
+        let view = TensorView::new(dtype, shape, frame).map_err(|e| bad(e.to_string()))?;
+        tensors.push((name.to_string(), view));
+    }
+    safetensors::serialize_to_file(tensors, None, path).map_err(|e| bad(e.to_string()))
+}

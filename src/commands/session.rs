@@ -1,0 +1,172 @@
+//! A client with what every command needs: which collection is meant, waiting, printing.
+
+use super::CommandError;
+use crate::cli::{Global, InCollection};
+use coseg::call;
+use coseg::ipc::client::Client;
+use coseg::ipc::endpoint::Endpoint;
+use coseg::ipc::wire;
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::Value;
+use std::io::{IsTerminal as _, Write as _};
+use std::time::Duration;
+
+/// Longest single wait in the daemon: an answer comes at least this often, well within the timeout.
+const LONGEST_WAIT: Duration = Duration::from_secs(1);
+
+/// A connection to the daemon and how to print.
+pub(crate) struct Session {
+    pub(crate) client: Client,
+    pub(crate) json: bool,
+}
+
+impl Session {
+    /// For the endpoint that was named, or the default one.
+    pub(crate) fn open(global: &Global) -> Result<Self, CommandError> {
+        let uri = match &global.endpoint {
+            Some(uri) => uri.clone(),
+            None => Endpoint::default_for_user().to_string(),
+        };
+        let client = Client::connect(&uri, global.timeout)?;
+        Ok(Self { client, json: global.json })
+    }
+
+    /// Milliseconds that the daemon may wait before it answers that nothing has changed.
+    pub(crate) fn wait_ms(&self) -> u64 {
+        let wait = (self.client.timeout() / 4).min(LONGEST_WAIT);
+        u64::try_from(wait.as_millis()).unwrap_or(u64::MAX)
+    }
+
+    /// The collection that was named, or the only one there is.
+    pub(crate) fn collection(&mut self, within: &InCollection) -> Result<String, CommandError> {
+        if let Some(name) = &within.collection {
+            return Ok(name.clone());
+        }
+        let mut names = self.collection_names()?;
+        match (names.pop(), names.is_empty()) {
+            (Some(only), true) => Ok(only),
+            (None, _) => Err(CommandError::Failed("there is no collection yet".to_owned())),
+            (Some(last), false) => {
+                names.push(last);
+                Err(ambiguous(&names))
+            }
+        }
+    }
+
+    /// Names of all collections.
+    pub(crate) fn collection_names(&mut self) -> Result<Vec<String>, CommandError> {
+        let reply = call!(self.client, ListCollections(wire::ListCollectionsRequest {}))?;
+        Ok(reply.collections.into_iter().filter_map(|c| c.spec).map(|s| s.name).collect())
+    }
+
+    /// One collection.
+    pub(crate) fn describe(&mut self, name: &str) -> Result<wire::Collection, CommandError> {
+        let request = wire::DescribeCollectionRequest { collection: name.to_owned() };
+        let reply = call!(self.client, DescribeCollection(request))?;
+        Ok(reply.collection.unwrap_or_default())
+    }
+
+    /// All shapes of a collection, or those that carry `label`.
+    pub(crate) fn shapes(
+        &mut self,
+        collection: &str,
+        label: Option<u32>,
+    ) -> Result<Vec<wire::Shape>, CommandError> {
+        let mut shapes = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let collection = collection.to_owned();
+            let request =
+                wire::ListShapesRequest { collection, page_size: 0, page_token, label };
+            let reply = call!(self.client, ListShapes(request))?;
+            shapes.extend(reply.shapes);
+            page_token = reply.next_page_token;
+            if page_token.is_empty() {
+                return Ok(shapes);
+            }
+        }
+    }
+
+    /// Waits until the collection has nothing left to do, for as long as the daemon answers.
+    pub(crate) fn wait_until_idle(&mut self, collection: &str) -> Result<(), CommandError> {
+        let mut bar = None;
+        loop {
+            let request = wire::WaitIdleRequest {
+                collection: collection.to_owned(),
+                wait_ms: self.wait_ms(),
+            };
+            let reply = call!(self.client, WaitIdle(request))?;
+            if reply.idle {
+                return Ok(());
+            }
+            let bar = bar.get_or_insert_with(|| spinner("waiting"));
+            bar.set_message(format!(
+                "{} shapes to place, {} to relabel",
+                reply.n_queued, reply.n_stale
+            ));
+            bar.tick();
+        }
+    }
+
+    /// Prints a line of data.
+    pub(crate) fn line(&self, text: &str) -> Result<(), CommandError> {
+        print_line(text)
+    }
+
+    /// Prints JSON, the only thing on stdout.
+    pub(crate) fn print_json(&self, value: &Value) -> Result<(), CommandError> {
+        print_line(&value.to_string())
+    }
+}
+
+/// Prints a line of data to stdout.
+pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{text}").and_then(|()| out.flush()).map_err(CommandError::Output)
+}
+
+/// Several collections could be meant.
+pub(crate) fn ambiguous(names: &[String]) -> CommandError {
+    let names = names.join(", ");
+    CommandError::Usage(format!("there are several collections, choose one with --collection: {names}"))
+}
+
+/// Columns padded to the widest entry; the first row is the heading.
+pub(crate) fn table(rows: &[Vec<String>]) -> String {
+    let n = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |i: usize| rows.iter().filter_map(|r| r.get(i)).map(|c| c.chars().count()).max();
+    let widths: Vec<usize> = (0..n).map(|i| width(i).unwrap_or(0)).collect();
+    let lines = rows.iter().map(|row| {
+        let cells = row.iter().zip(&widths).map(|(cell, &width)| format!("{cell:width$}"));
+        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
+    });
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+/// A progress bar on stderr if that is a terminal, else one that draws nothing.
+pub(crate) fn bar(length: u64) -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {wide_msg}")
+        .expect("invariant: the template is valid");
+    ProgressBar::new(length).with_style(style)
+}
+
+fn spinner(message: &'static str) -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    ProgressBar::new_spinner().with_message(message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::table;
+
+    #[test]
+    fn columns_line_up() {
+        let row = |a: &str, b: &str| vec![a.to_owned(), b.to_owned()];
+        assert_eq!(table(&[row("name", "n"), row("a", "12")]), "name  n\na     12");
+    }
+}

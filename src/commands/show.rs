@@ -1,0 +1,108 @@
+//! `coseg show`: one shape with its parts and sources, or one collection with its labels.
+
+use super::session::{Session, table};
+use super::{Outcome, json};
+use crate::cli::Show;
+use coseg::call;
+use coseg::ipc::wire;
+
+pub(crate) fn run(args: &Show, mut session: Session) -> Outcome {
+    let collection = session.collection(&args.within)?;
+    let described = session.describe(&collection)?;
+    match &args.shape {
+        Some(shape) => {
+            let request = wire::GetShapeRequest { collection, shape: shape.clone() };
+            let shape = call!(session.client, GetShape(request))?.shape.unwrap_or_default();
+            show_shape(&shape, &described, &session)
+        }
+        None => show_collection(&described, &session),
+    }
+}
+
+/// The name of a label, or its id.
+fn label_name(collection: &wire::Collection, id: u32) -> String {
+    let label = collection.labels.iter().find(|l| l.id == id);
+    let name = label.map(|l| l.name.as_str()).filter(|n| !n.is_empty());
+    name.map_or_else(|| id.to_string(), |name| format!("{id} {name}"))
+}
+
+fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
+    if session.json {
+        session.print_json(&json::collection(c))?;
+        return Ok(true);
+    }
+    let spec = c.spec.clone().unwrap_or_default();
+    let n_parts = spec.n_parts.filter(|&n| n > 0);
+    let parts = n_parts.map_or_else(|| "estimated".to_owned(), |n| n.to_string());
+    session.line(&format!(
+        "{}: {} shapes ({} stale), parts {parts}, up {}, sequence {}",
+        spec.name,
+        c.n_shapes,
+        c.n_stale,
+        json::up(spec.up()),
+        c.sequence
+    ))?;
+    let mut rows = vec![["label", "name", "colour", "state"].map(str::to_owned).to_vec()];
+    for l in &c.labels {
+        let state = l.merged_into.map(|id| format!("merged into {id}"));
+        rows.push(vec![
+            l.id.to_string(),
+            l.name.clone(),
+            json::colour(l.colour_rgb),
+            state.unwrap_or_else(|| "in use".to_owned()),
+        ]);
+    }
+    session.line(&table(&rows))?;
+    Ok(true)
+}
+
+fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session) -> Outcome {
+    if session.json {
+        session.print_json(&json::shape(s))?;
+        return Ok(true);
+    }
+    let state = if s.stale { "stale" } else { "current" };
+    session.line(&format!(
+        "{}: shape {} of its collection, {} faces, area {}, labels version {} ({state})",
+        s.name, s.ordinal, s.n_polygons, s.area, s.version
+    ))?;
+    if let Some(r) = &s.report {
+        let counts = [
+            ("vertices welded", r.n_welded_vertices),
+            ("isolated vertices", r.n_isolated_vertices),
+            ("degenerate triangles dropped", r.n_degenerate_triangles),
+            ("duplicate triangles dropped", r.n_duplicate_triangles),
+            ("non-manifold edges", r.n_nonmanifold_edges),
+            ("boundary edges", r.n_boundary_edges),
+            ("virtual edges between components", r.n_bridges),
+        ];
+        let found: Vec<String> = counts
+            .iter()
+            .filter(|(_, n)| *n > 0)
+            .map(|(what, n)| format!("{n} {what}"))
+            .collect();
+        let found = if found.is_empty() { "clean".to_owned() } else { found.join(", ") };
+        session.line(&format!(
+            "mesh: {} components, {found}; proxy of {} faces",
+            r.n_components, r.n_proxy_faces
+        ))?;
+    }
+    let mut rows = vec![["part", "label", "area", "confidence"].map(str::to_owned).to_vec()];
+    for (i, p) in s.parts.iter().enumerate() {
+        rows.push(vec![
+            i.to_string(),
+            label_name(collection, p.label),
+            format!("{:.1} %", p.area_share * 100.0),
+            format!("{:.2}", p.confidence),
+        ]);
+    }
+    session.line(&table(&rows))?;
+    if !s.sources.is_empty() {
+        let sources = s.sources.iter();
+        let sources: Vec<_> = sources
+            .map(|s| format!("{} version {} ({:.0} %)", s.shape, s.version, s.weight * 100.0))
+            .collect();
+        session.line(&format!("labels carried from {}", sources.join(", ")))?;
+    }
+    Ok(true)
+}

@@ -1,0 +1,18 @@
+//! `coseg wait`: until a collection has nothing left to do.
+
+use super::Outcome;
+use super::session::Session;
+use crate::cli::InCollection;
+use serde_json::json;
+use std::time::Instant;
+
+pub(crate) fn run(args: &InCollection, mut session: Session) -> Outcome {
+    let begin = Instant::now();
+    let collection = session.collection(args)?;
+    session.wait_until_idle(&collection)?;
+    if session.json {
+        let seconds = begin.elapsed().as_secs_f64();
+        session.print_json(&json!({ "collection": collection, "idle": true, "seconds": seconds }))?;
+    }
+    Ok(true)
+}

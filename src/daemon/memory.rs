@@ -1,0 +1,113 @@
+//! A number of bytes that work in hand may take, handed out in reservations.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::Notify;
+
+/// Bytes to hand out.
+pub(crate) struct Budget {
+    state: Mutex<State>,
+    freed: Notify,
+}
+
+struct State {
+    limit: u64,
+    used: u64,
+}
+
+/// Bytes that were handed out; dropping it gives them back.
+pub(crate) struct Reservation {
+    budget: Arc<Budget>,
+    bytes: u64,
+}
+
+impl Budget {
+    pub(crate) fn new(limit: u64) -> Arc<Self> {
+        Arc::new(Self { state: Mutex::new(State { limit, used: 0 }), freed: Notify::new() })
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        // Two integers are whole whatever panicked.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Reserves now or not at all.
+    pub(crate) fn try_reserve(self: &Arc<Self>, bytes: u64) -> Option<Reservation> {
+        let mut state = self.state();
+        let used = state.used.checked_add(bytes).filter(|&used| used <= state.limit)?;
+        state.used = used;
+        Some(Reservation { budget: Arc::clone(self), bytes })
+    }
+
+    /// Waits until there is room. More than the limit is handed out when nothing else is, so that a limit
+    /// that was lowered cannot block for ever. Only one task may wait.
+    pub(crate) async fn reserve(self: &Arc<Self>, bytes: u64) -> Reservation {
+        loop {
+            let freed = self.freed.notified();
+            let limit = self.state().limit;
+            if let Some(reservation) = self.try_reserve(bytes.min(limit)) {
+                return reservation;
+            }
+            freed.await;
+        }
+    }
+
+    pub(crate) fn set_limit(&self, limit: u64) {
+        self.state().limit = limit;
+        self.freed.notify_one();
+    }
+
+    pub(crate) fn used(&self) -> u64 {
+        self.state().used
+    }
+}
+
+impl Reservation {
+    /// Gives back all but `bytes`.
+    pub(crate) fn shrink_to(&mut self, bytes: u64) {
+        let excess = self.bytes.saturating_sub(bytes);
+        self.bytes -= excess;
+        self.budget.state().used -= excess;
+        self.budget.freed.notify_one();
+    }
+}
+
+impl Drop for Reservation {
+    fn drop(&mut self) {
+        self.shrink_to(0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Budget;
+
+    #[test]
+    fn bytes_are_handed_out_once() {
+        let budget = Budget::new(100);
+        let mut a = budget.try_reserve(60).unwrap();
+        assert!(budget.try_reserve(41).is_none());
+        assert!(budget.try_reserve(u64::MAX).is_none());
+        let b = budget.try_reserve(40).unwrap();
+        a.shrink_to(10);
+        assert_eq!(budget.used(), 50);
+        drop((a, b));
+        assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn waiting_ends_when_bytes_come_back() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(async {
+            let budget = Budget::new(100);
+            let held = budget.reserve(100).await;
+            let waiting = tokio::spawn({
+                let budget = std::sync::Arc::clone(&budget);
+                async move { budget.reserve(1_000).await.bytes }
+            });
+            tokio::task::yield_now().await;
+            assert!(!waiting.is_finished());
+            drop(held);
+            assert_eq!(waiting.await.unwrap(), 100);
+        });
+    }
+}

@@ -1,0 +1,244 @@
+//! What this process is doing for each job: stages, revisions, cancellations.
+//!
+//! The catalog knows what is durable; the stage a shape is at is not, and lives here.
+
+use crate::library::JobItem;
+use std::collections::{HashMap, VecDeque};
+use tokio::sync::mpsc;
+
+/// A shape that waits to be described.
+#[derive(Debug, Clone)]
+pub(crate) struct Waiting {
+    pub(crate) item: JobItem,
+    /// Bytes of its file.
+    pub(crate) n_bytes: u64,
+}
+
+/// A job of which something is left to do.
+#[derive(Debug, Default)]
+struct LiveJob {
+    revision: u64,
+    n_live: usize,
+    stages: HashMap<u32, String>,
+    cancelled: bool,
+}
+
+/// Shapes of one collection that wait to be described, and the way to its placing lane.
+struct Lane<S> {
+    waiting: VecDeque<Waiting>,
+    n_live: usize,
+    steps: mpsc::UnboundedSender<S>,
+}
+
+/// All accepted shapes that are not placed yet. `S`: what placing lanes are told.
+pub(crate) struct Progress<S> {
+    lanes: HashMap<String, Lane<S>>,
+    /// Collections with waiting shapes; the first has the turn.
+    turns: VecDeque<String>,
+    jobs: HashMap<u64, LiveJob>,
+    /// Jobs are numbered in order of acceptance; this is the last one taken up.
+    highest_job: u64,
+    /// Counts changes, so that a job taken up again after a restart does not repeat its revisions soon.
+    n_changes: u64,
+}
+
+impl<S> Progress<S> {
+    pub(crate) fn new() -> Self {
+        Self {
+            lanes: HashMap::new(),
+            turns: VecDeque::new(),
+            jobs: HashMap::new(),
+            highest_job: 0,
+            n_changes: 0,
+        }
+    }
+
+    /// The way to the lane of `collection`, if there is one.
+    pub(crate) fn lane(&self, collection: &str) -> Option<&mpsc::UnboundedSender<S>> {
+        self.lanes.get(collection).map(|l| &l.steps)
+    }
+
+    pub(crate) fn add_lane(&mut self, collection: &str, steps: mpsc::UnboundedSender<S>) {
+        let lane = Lane { waiting: VecDeque::new(), n_live: 0, steps };
+        self.lanes.insert(collection.to_owned(), lane);
+    }
+
+    /// Lets all lanes end when they have done what they were told.
+    pub(crate) fn close(&mut self) {
+        self.lanes.clear();
+        self.turns.clear();
+    }
+
+    /// Lets the lane of a collection that is gone end, unless it still has something to do.
+    pub(crate) fn remove_idle_lane(&mut self, collection: &str) {
+        if self.lanes.get(collection).is_some_and(|l| l.n_live == 0) {
+            self.lanes.remove(collection);
+        }
+    }
+
+    /// Whether a job was taken up before, as when its request is repeated.
+    pub(crate) fn is_known(&self, job: u64) -> bool {
+        job <= self.highest_job
+    }
+
+    /// Takes up a shape, after all others of its collection, whose lane must be there.
+    pub(crate) fn push(&mut self, waiting: Waiting) {
+        let (job, collection) = (waiting.item.job, waiting.item.collection.clone());
+        self.highest_job = self.highest_job.max(job);
+        let lane = self.lanes.get_mut(&collection).expect("invariant: lanes come before shapes");
+        if lane.waiting.is_empty() {
+            self.turns.push_back(collection);
+        }
+        lane.waiting.push_back(waiting);
+        lane.n_live += 1;
+        self.jobs.entry(job).or_default().n_live += 1;
+        self.touch(job);
+    }
+
+    /// The next shape to describe: collections take turns.
+    pub(crate) fn pop(&mut self) -> Option<(Waiting, mpsc::UnboundedSender<S>)> {
+        while let Some(collection) = self.turns.pop_front() {
+            let Some(lane) = self.lanes.get_mut(&collection) else { continue };
+            let Some(waiting) = lane.waiting.pop_front() else { continue };
+            let steps = lane.steps.clone();
+            if !lane.waiting.is_empty() {
+                self.turns.push_back(collection);
+            }
+            return Some((waiting, steps));
+        }
+        None
+    }
+
+    /// Drops the waiting shapes of a job that `is_over` says are over.
+    pub(crate) fn drop_waiting(&mut self, job: u64, is_over: impl Fn(u32) -> bool) {
+        let mut dropped = Vec::new();
+        for lane in self.lanes.values_mut() {
+            lane.waiting.retain(|w| {
+                let over = w.item.job == job && is_over(w.item.index);
+                if over {
+                    dropped.push(w.item.clone());
+                }
+                !over
+            });
+        }
+        for item in &dropped {
+            self.finish(item);
+        }
+    }
+
+    /// Notes the stage that a shape is at.
+    pub(crate) fn set_stage(&mut self, item: &JobItem, stage: &str) {
+        if let Some(job) = self.jobs.get_mut(&item.job) {
+            job.stages.insert(item.index, stage.to_owned());
+            self.touch(item.job);
+        }
+    }
+
+    /// Nothing of this shape is left to do.
+    pub(crate) fn finish(&mut self, item: &JobItem) {
+        if let Some(lane) = self.lanes.get_mut(&item.collection) {
+            lane.n_live = lane.n_live.saturating_sub(1);
+        }
+        self.touch(item.job);
+        if let Some(job) = self.jobs.get_mut(&item.job) {
+            job.stages.remove(&item.index);
+            job.n_live = job.n_live.saturating_sub(1);
+            if job.n_live == 0 {
+                self.jobs.remove(&item.job);
+            }
+        }
+    }
+
+    pub(crate) fn cancel(&mut self, job: u64) {
+        if let Some(live) = self.jobs.get_mut(&job) {
+            live.cancelled = true;
+            self.touch(job);
+        }
+    }
+
+    pub(crate) fn is_cancelled(&self, job: u64) -> bool {
+        self.jobs.get(&job).is_some_and(|j| j.cancelled)
+    }
+
+    /// The revision of a job of which something is left to do.
+    pub(crate) fn revision(&self, job: u64) -> Option<u64> {
+        self.jobs.get(&job).map(|j| j.revision)
+    }
+
+    pub(crate) fn stage(&self, job: u64, index: u32) -> Option<&str> {
+        self.jobs.get(&job)?.stages.get(&index).map(String::as_str)
+    }
+
+    /// Accepted shapes that are not placed yet, of one collection or of all.
+    pub(crate) fn n_live(&self, collection: Option<&str>) -> usize {
+        match collection {
+            Some(name) => self.lanes.get(name).map_or(0, |l| l.n_live),
+            None => self.lanes.values().map(|l| l.n_live).sum(),
+        }
+    }
+
+    fn touch(&mut self, job: u64) {
+        self.n_changes += 1;
+        if let Some(live) = self.jobs.get_mut(&job) {
+            live.revision = self.n_changes;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Progress, Waiting};
+    use crate::library::{ItemState, JobItem};
+    use tokio::sync::mpsc;
+
+    fn waiting(collection: &str, job: u64, index: u32) -> Waiting {
+        let item = JobItem {
+            job,
+            index,
+            collection: collection.to_owned(),
+            name: format!("{collection}{index}"),
+            state: ItemState::Queued,
+        };
+        Waiting { item, n_bytes: 1 }
+    }
+
+    fn progress() -> Progress<()> {
+        let mut progress = Progress::new();
+        for collection in ["a", "b"] {
+            progress.add_lane(collection, mpsc::unbounded_channel().0);
+        }
+        progress
+    }
+
+    #[test]
+    fn collections_take_turns_and_keep_their_order() {
+        let mut progress = progress();
+        for index in 0..3 {
+            progress.push(waiting("a", 1, index));
+        }
+        progress.push(waiting("b", 2, 0));
+        let order: Vec<_> =
+            std::iter::from_fn(|| progress.pop()).map(|(w, _)| w.item.name).collect();
+        assert_eq!(order, ["a0", "b0", "a1", "a2"]);
+    }
+
+    #[test]
+    fn a_job_lives_until_its_last_shape_is_over() {
+        let mut progress = progress();
+        progress.push(waiting("a", 7, 0));
+        progress.push(waiting("a", 7, 1));
+        assert!(progress.is_known(7) && progress.is_known(6) && !progress.is_known(8));
+        let before = progress.revision(7).unwrap();
+        let (first, _) = progress.pop().unwrap();
+        progress.set_stage(&first.item, "spectrum");
+        assert_eq!(progress.stage(7, 0), Some("spectrum"));
+        assert!(progress.revision(7).unwrap() > before);
+        progress.finish(&first.item);
+        assert_eq!((progress.n_live(Some("a")), progress.n_live(None)), (1, 1));
+        progress.cancel(7);
+        assert!(progress.is_cancelled(7));
+        progress.drop_waiting(7, |index| index == 1);
+        assert_eq!((progress.n_live(None), progress.revision(7)), (0, None));
+        assert!(progress.pop().is_none());
+    }
+}

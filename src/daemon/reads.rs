@@ -1,0 +1,223 @@
+//! Requests that change nothing, answered from the library.
+
+use crate::daemon::requests::{Answer, MAX_WAIT_MS};
+use crate::daemon::sockets::{MAX_FRAMES, MAX_HEADER_BYTES, MAX_ID_CHARS};
+use crate::daemon::{Daemon, requests};
+use crate::ipc::frames::FrameWriter;
+use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
+use crate::ipc::{PROTOCOL, convert};
+use crate::library::LibraryError;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+/// Entries of a page.
+const MAX_PAGE: u32 = 1_000;
+/// Neighbours when the request does not say how many.
+const DEFAULT_NEIGHBORS: u32 = 5;
+/// What this version knows beyond the names of its requests.
+const CAPABILITIES: [&str; 6] = [
+    "add_shapes.create",
+    "add_shapes.wait",
+    "add_shapes.arrays",
+    "add_shapes.path",
+    "idempotency",
+    "events",
+];
+
+/// Answers one request.
+pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
+    let library = &daemon.library;
+    let mut frames = FrameWriter::default();
+    let result = match body {
+        Body::Hello(_) => Reply::Hello(hello(daemon)),
+        Body::Stats(_) => Reply::Stats(stats(daemon).map_err(refuse)?),
+        Body::ListCollections(_) => {
+            let collections = library.collections().map_err(refuse)?;
+            let collections = collections.iter().map(convert::collection).collect();
+            Reply::ListCollections(wire::ListCollectionsReply { collections })
+        }
+        Body::DescribeCollection(r) => {
+            let collection = library.collection(&r.collection).map_err(refuse)?;
+            let collection = Some(convert::collection(&collection));
+            Reply::DescribeCollection(wire::DescribeCollectionReply { collection })
+        }
+        Body::GetJob(r) => {
+            let job = library.job(r.job_id).map_err(refuse)?;
+            Reply::GetJob(wire::GetJobReply { job: Some(daemon.job_to_wire(&job)) })
+        }
+        Body::ListShapes(r) => Reply::ListShapes(list_shapes(daemon, &r)?),
+        Body::GetShape(r) => {
+            let shape = library.shape(&r.collection, &r.shape).map_err(refuse)?;
+            Reply::GetShape(wire::GetShapeReply { shape: Some(convert::shape(&shape)) })
+        }
+        Body::GetLabels(r) => {
+            let version = Some(r.version).filter(|&v| v > 0);
+            let labels = library.labels(&r.collection, &r.shape, version).map_err(refuse)?;
+            Reply::GetLabels(convert::labels(&labels, r.confidence, &mut frames))
+        }
+        Body::GetOriginal(r) => {
+            let (bytes, format) = library.original(&r.collection, &r.shape).map_err(refuse)?;
+            Reply::GetOriginal(convert::original(bytes, format, &mut frames))
+        }
+        Body::LabelsSnapshot(r) => {
+            let (sequence, shapes) = library.labels_snapshot(&r.collection).map_err(refuse)?;
+            Reply::LabelsSnapshot(convert::labels_snapshot(sequence, &shapes, &mut frames))
+        }
+        Body::GetSpectrum(r) => {
+            let area = library.shape(&r.collection, &r.shape).map_err(refuse)?.area;
+            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            let view = description.view();
+            Reply::GetSpectrum(convert::spectrum(&view, area, r.eigenvectors, &mut frames))
+        }
+        Body::GetHks(r) => {
+            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            Reply::GetHks(convert::hks(&description.view(), &mut frames))
+        }
+        Body::GetDescriptors(r) => {
+            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            Reply::GetDescriptors(convert::descriptors(&description.view(), &mut frames))
+        }
+        Body::GetFunctionalMap(r) => {
+            let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
+            Reply::GetFunctionalMap(convert::functional_map(&map, &mut frames))
+        }
+        Body::GetPartCorrespondence(r) => {
+            let (matches, quality) = library
+                .part_correspondence(&r.collection, &r.shape_a, &r.shape_b)
+                .map_err(refuse)?;
+            Reply::GetPartCorrespondence(convert::part_correspondence(&matches, &quality))
+        }
+        Body::Nearest(r) => {
+            let limit = page("limit", r.limit, DEFAULT_NEIGHBORS)?;
+            let nearest = library.nearest(&r.collection, &r.shape, limit).map_err(refuse)?;
+            Reply::Nearest(convert::nearest(nearest))
+        }
+        Body::EventsSince(r) => Reply::EventsSince(events_since(daemon, &r)?),
+        Body::CreateCollection(_)
+        | Body::DeleteCollection(_)
+        | Body::NameLabel(_)
+        | Body::AddShapes(_)
+        | Body::CancelJob(_)
+        | Body::RemoveShape(_)
+        | Body::Drain(_)
+        | Body::WatchJob(_)
+        | Body::WaitIdle(_) => unreachable!("invariant: dispatch sends only reads here"),
+    };
+    Ok((result, frames.finish()))
+}
+
+fn refuse(e: LibraryError) -> wire::Error {
+    convert::library_error(&e)
+}
+
+/// The number of entries asked for, or `default` if 0.
+fn page(field: &str, asked: u32, default: u32) -> Result<usize, wire::Error> {
+    if asked > MAX_PAGE {
+        let text = format!("{field} is {asked}, the limit is {MAX_PAGE}");
+        return Err(convert::field_error(ErrorReason::FieldRange, field, text));
+    }
+    Ok(if asked == 0 { default } else { asked } as usize)
+}
+
+fn list_shapes(
+    daemon: &Daemon,
+    r: &wire::ListShapesRequest,
+) -> Result<wire::ListShapesReply, wire::Error> {
+    let size = page("page_size", r.page_size, MAX_PAGE)?;
+    let after = match r.page_token.as_str() {
+        "" => 0,
+        token => token.parse().map_err(|_| {
+            let text = format!("page_token {token:?} was not made by this daemon");
+            convert::field_error(ErrorReason::FieldRange, "page_token", text)
+        })?,
+    };
+    // One more tells whether there is another page.
+    let mut shapes =
+        daemon.library.shapes(&r.collection, after, size + 1, r.label).map_err(refuse)?;
+    let more = shapes.len() > size;
+    shapes.truncate(size);
+    let last = shapes.last().filter(|_| more).map(|s| s.ordinal.to_string());
+    Ok(wire::ListShapesReply {
+        shapes: shapes.iter().map(convert::shape).collect(),
+        next_page_token: last.unwrap_or_default(),
+    })
+}
+
+fn events_since(
+    daemon: &Daemon,
+    r: &wire::EventsSinceRequest,
+) -> Result<wire::EventsSinceReply, wire::Error> {
+    let limit = page("limit", r.limit, MAX_PAGE)?;
+    let mut events =
+        daemon.library.events_since(&r.collection, r.sequence, limit + 1).map_err(refuse)?;
+    let more = events.len() > limit;
+    events.truncate(limit);
+    let events = events.iter().map(|e| convert::event(&r.collection, e)).collect();
+    Ok(wire::EventsSinceReply { events, more })
+}
+
+fn hello(daemon: &Daemon) -> wire::HelloReply {
+    let limits = daemon.config().limits.clone();
+    wire::HelloReply {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        protocol: PROTOCOL.to_owned(),
+        limits: Some(wire::Limits {
+            max_message_bytes: limits.max_message.0,
+            max_frames: MAX_FRAMES as u32,
+            max_header_bytes: MAX_HEADER_BYTES,
+            max_shapes_per_request: u32::try_from(limits.max_shapes_per_request)
+                .unwrap_or(u32::MAX),
+            max_shape_bytes: limits.shape_bytes(),
+            max_queued_shapes: limits.max_queued_shapes as u64,
+            max_page: MAX_PAGE,
+            max_wait_ms: requests::MAX_WAIT_MS.min(MAX_WAIT_MS),
+            max_id_chars: MAX_ID_CHARS as u32,
+        }),
+        formats: vec![wire::MeshFormat::Obj.into(), wire::MeshFormat::Off.into()],
+        capabilities: CAPABILITIES.map(str::to_owned).to_vec(),
+        event_endpoint: daemon.events.to_string(),
+        instance: daemon.instance.clone(),
+    }
+}
+
+fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
+    let s = daemon.library.stats()?;
+    let count = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
+    let config = daemon.config();
+    Ok(wire::StatsReply {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        instance: daemon.instance.clone(),
+        pid: std::process::id(),
+        uptime_ms: u64::try_from(daemon.started.elapsed().as_millis()).unwrap_or(u64::MAX),
+        n_collections: s.n_collections,
+        n_shapes: s.n_shapes,
+        n_queued: s.n_queued,
+        n_stale: s.n_stale,
+        stored_bytes: s.stored_bytes,
+        catalog_bytes: s.catalog_bytes,
+        max_relabelled: s.max_relabelled,
+        max_maps: s.max_maps,
+        n_requests: count(&daemon.counters.requests),
+        n_refused: count(&daemon.counters.refused),
+        n_failed: count(&daemon.counters.failed),
+        memory_limit_bytes: config.limits.memory.0,
+        memory_reserved_bytes: daemon.request_memory.used() + daemon.describe_memory.used(),
+        resident_bytes: resident_bytes(),
+        workers: daemon.n_workers as u32,
+    })
+}
+
+/// Resident memory of this process as the kernel counts it; 0 if it does not say.
+fn resident_bytes() -> u64 {
+    let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return 0 };
+    let kib = status.lines().find_map(|l| l.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB"));
+    kib.and_then(|n| n.parse::<u64>().ok()).unwrap_or(0) << 10
+}
+
+/// Stored shapes whose labels wait to be recomputed, of one collection or of all.
+pub(crate) fn n_stale(daemon: &Daemon, collection: Option<&str>) -> Result<u64, LibraryError> {
+    match collection {
+        Some(name) => Ok(daemon.library.collection(name)?.n_stale),
+        None => Ok(daemon.library.stats()?.n_stale),
+    }
+}

@@ -1,0 +1,334 @@
+//! Requests are sorted by what they need: reads run side by side, changes one after the other in order
+//! of arrival, waits hold no thread.
+
+use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
+use crate::daemon::{Daemon, blocking, reads, writes};
+use crate::ipc::convert;
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
+use crate::library::Job;
+use bytes::Bytes;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+
+/// Longest wait of WatchJob and WaitIdle, in milliseconds.
+pub(crate) const MAX_WAIT_MS: u64 = 30_000;
+/// WatchJob answers changes no faster than this, so that a client that asks again at once does not read
+/// a job from the catalog a thousand times a second.
+const WATCH_PACE: Duration = Duration::from_millis(50);
+/// Reads that run at a time beyond the workers; they mostly wait for the disk.
+const EXTRA_READS: usize = 2;
+
+/// The result and raw frames of a reply.
+pub(crate) type Answer = Result<(reply::Result, Vec<Bytes>), wire::Error>;
+
+/// A request in hand. Its permit bounds how many there are.
+pub(crate) struct InHand {
+    pub(crate) incoming: Incoming,
+    permit: OwnedSemaphorePermit,
+}
+
+/// Sorts requests until the socket thread ends.
+pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<Incoming>) {
+    // Bounded by the permits.
+    let (writes_in, writes_out) = mpsc::unbounded_channel();
+    tokio::spawn(change_in_order(Arc::clone(&daemon), writes_out));
+    let readers = Arc::new(Semaphore::new(daemon.n_workers + EXTRA_READS));
+    while let Some(mut incoming) = requests.recv().await {
+        let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
+            let error = busy("too many requests are in hand");
+            daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            continue;
+        };
+        let Some(body) = incoming.request.body.take() else {
+            let error = convert::error(
+                ErrorCode::InvalidArgument,
+                ErrorReason::UnknownRequest,
+                "the request has no body that this version knows",
+            );
+            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            continue;
+        };
+        let in_hand = InHand { incoming, permit };
+        let daemon = Arc::clone(&daemon);
+        match body {
+            Body::CreateCollection(_)
+            | Body::DeleteCollection(_)
+            | Body::NameLabel(_)
+            | Body::AddShapes(_)
+            | Body::CancelJob(_)
+            | Body::RemoveShape(_)
+            | Body::Drain(_) => {
+                // The receiver ends after this sender.
+                let _ = writes_in.send((body, in_hand));
+            }
+            Body::WatchJob(request) => {
+                tokio::spawn(in_hand.respond(daemon, async move |d| watch_job(&d, &request).await));
+            }
+            Body::WaitIdle(request) => {
+                tokio::spawn(in_hand.respond(daemon, async move |d| wait_idle(&d, &request).await));
+            }
+            Body::Hello(_)
+            | Body::Stats(_)
+            | Body::ListCollections(_)
+            | Body::DescribeCollection(_)
+            | Body::GetJob(_)
+            | Body::ListShapes(_)
+            | Body::GetShape(_)
+            | Body::GetLabels(_)
+            | Body::GetOriginal(_)
+            | Body::LabelsSnapshot(_)
+            | Body::GetSpectrum(_)
+            | Body::GetHks(_)
+            | Body::GetDescriptors(_)
+            | Body::GetFunctionalMap(_)
+            | Body::GetPartCorrespondence(_)
+            | Body::Nearest(_)
+            | Body::EventsSince(_) => {
+                let readers = Arc::clone(&readers);
+                tokio::spawn(in_hand.respond(daemon, async move |d| {
+                    let reader = readers.acquire_owned().await;
+                    let _reader = reader.expect("invariant: the semaphore is never closed");
+                    blocking(&d, move |d| reads::answer(d, body)).await.unwrap_or_else(panicked)
+                }));
+            }
+        }
+    }
+}
+
+/// Carries out changes in order of arrival.
+async fn change_in_order(
+    daemon: Arc<Daemon>,
+    mut changes: mpsc::UnboundedReceiver<(Body, InHand)>,
+) {
+    while let Some((body, in_hand)) = changes.recv().await {
+        let request = &in_hand.incoming.request;
+        let key = writes::key(request);
+        let frames = in_hand.incoming.frames.clone();
+        if in_hand.is_late() {
+            in_hand.late(&daemon, None);
+            continue;
+        }
+        let done =
+            blocking(&daemon, move |d| writes::change(d, &body, &frames, key.as_ref())).await;
+        match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
+            Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((result, Vec::new()))),
+            Ok(writes::Done::WhenPlaced(job)) => {
+                let daemon = Arc::clone(&daemon);
+                tokio::spawn(async move {
+                    let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
+                    match placed {
+                        Some(answer) => in_hand.finish(&daemon, answer),
+                        None => in_hand.late(&daemon, Some(job)),
+                    }
+                });
+            }
+            Err(error) => in_hand.finish(&daemon, Err(error)),
+        }
+    }
+}
+
+impl InHand {
+    /// Sends the reply and gives back the permit.
+    fn finish(self, daemon: &Daemon, answer: Answer) {
+        daemon.answer(self.incoming.peer, self.incoming.request.request_id, answer);
+        drop(self.permit);
+    }
+
+    /// Answers with what `work` returns, or that the deadline passed.
+    async fn respond<F: Future<Output = Answer>>(
+        self,
+        daemon: Arc<Daemon>,
+        work: impl FnOnce(Arc<Daemon>) -> F,
+    ) {
+        match self.by_deadline(work(Arc::clone(&daemon))).await {
+            Some(answer) => self.finish(&daemon, answer),
+            None => self.late(&daemon, None),
+        }
+    }
+
+    fn deadline(&self) -> Option<Instant> {
+        let ms = self.incoming.request.deadline_ms;
+        (ms > 0).then(|| self.incoming.received.checked_add(Duration::from_millis(ms))).flatten()
+    }
+
+    fn is_late(&self) -> bool {
+        self.deadline().is_some_and(|d| d <= Instant::now())
+    }
+
+    async fn by_deadline<T>(&self, work: impl Future<Output = T>) -> Option<T> {
+        match self.deadline() {
+            Some(deadline) => tokio::time::timeout_at(deadline.into(), work).await.ok(),
+            None => Some(work.await),
+        }
+    }
+
+    fn late(self, daemon: &Daemon, job: Option<u64>) {
+        let ms = self.incoming.request.deadline_ms;
+        let mut error = convert::error(
+            ErrorCode::DeadlineExceeded,
+            ErrorReason::Deadline,
+            format!("no answer within the request's {ms} ms"),
+        );
+        error.subject = job.map(Subject::JobId);
+        self.finish(daemon, Err(error));
+    }
+}
+
+impl Daemon {
+    fn answer(&self, peer: Peer, request_id: String, answer: Answer) {
+        let (result, frames) = match answer {
+            Ok((result, frames)) => (result, frames),
+            Err(error) => {
+                if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
+                    tracing::error!(request_id, message = error.message, "a request failed");
+                }
+                (reply::Result::Error(error), Vec::new())
+            }
+        };
+        self.outbox.reply(peer, Reply { request_id, result: Some(result) }, frames);
+    }
+
+    /// A job with what this process knows of it.
+    pub(crate) fn job_to_wire(&self, job: &Job) -> wire::Job {
+        let progress = self.work.progress();
+        let items: Vec<_> =
+            job.items.iter().map(|i| convert::item(i, progress.stage(job.id, i.index))).collect();
+        let n_over = job.items.iter().filter(|i| convert::job_finished(&i.state)).count();
+        wire::Job {
+            job_id: job.id,
+            collection: job.collection.clone(),
+            finished: n_over == job.items.len(),
+            progress: n_over as f64 / job.items.len().max(1) as f64,
+            // A finished job changes no more.
+            revision: progress.revision(job.id).unwrap_or(u64::MAX),
+            items,
+        }
+    }
+}
+
+fn busy(message: &str) -> wire::Error {
+    let mut error =
+        convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, message);
+    error.retry_after_ms = BUSY_RETRY_MS;
+    error
+}
+
+fn panic_error(panic: &str) -> wire::Error {
+    convert::error(ErrorCode::Internal, ErrorReason::Panic, format!("answering panicked: {panic}"))
+}
+
+fn panicked(panic: String) -> Answer {
+    Err(panic_error(&panic))
+}
+
+pub(crate) fn draining() -> wire::Error {
+    convert::error(
+        ErrorCode::FailedPrecondition,
+        ErrorReason::Draining,
+        "the daemon is shutting down; what it accepted is resumed at its next start",
+    )
+}
+
+/// Reads a job and shows it.
+async fn read_job(daemon: &Arc<Daemon>, job: u64) -> Result<wire::Job, wire::Error> {
+    let read = blocking(daemon, move |d| d.library.job(job).map(|j| d.job_to_wire(&j))).await;
+    match read {
+        Ok(Ok(job)) => Ok(job),
+        Ok(Err(e)) => Err(convert::library_error(&e)),
+        Err(panic) => Err(panic_error(&panic)),
+    }
+}
+
+/// The answer to AddShapes with ADD_MODE_WAIT.
+async fn wait_placed(daemon: &Arc<Daemon>, job: u64) -> Answer {
+    let mut changes = daemon.work.changes();
+    let mut drain = daemon.drain.subscribe();
+    while daemon.work.progress().revision(job).is_some() {
+        tokio::select! {
+            _ = changes.changed() => {}
+            _ = drain.wait_for(|&d| d) => break,
+        }
+    }
+    let job = read_job(daemon, job).await?;
+    if !job.finished {
+        return Err(convert::with_subject(draining(), Subject::JobId(job.job_id)));
+    }
+    let reply = convert::add_shapes(job.job_id, job.items.len(), Some(job));
+    Ok((reply::Result::AddShapes(reply), Vec::new()))
+}
+
+fn wait_limit(ms: u64) -> Result<Duration, wire::Error> {
+    if ms <= MAX_WAIT_MS {
+        return Ok(Duration::from_millis(ms));
+    }
+    let text = format!("wait_ms is {ms}, the limit is {MAX_WAIT_MS}");
+    Err(convert::field_error(ErrorReason::FieldRange, "wait_ms", text))
+}
+
+async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Answer {
+    let begin = tokio::time::Instant::now();
+    let until = begin + wait_limit(request.wait_ms)?;
+    let mut changes = daemon.work.changes();
+    let mut drain = daemon.drain.subscribe();
+    loop {
+        let revision = daemon.work.progress().revision(request.job_id);
+        let Some(revision) = revision else { break };
+        if revision != request.revision && begin.elapsed() >= WATCH_PACE {
+            break;
+        }
+        let pace = begin + WATCH_PACE;
+        let wake = if revision == request.revision { until } else { pace.min(until) };
+        tokio::select! {
+            _ = changes.changed() => {}
+            () = tokio::time::sleep_until(wake) => {
+                if wake == until {
+                    break;
+                }
+            }
+            _ = drain.wait_for(|&d| d) => break,
+        }
+    }
+    let job = read_job(daemon, request.job_id).await?;
+    Ok((reply::Result::WatchJob(wire::WatchJobReply { job: Some(job) }), Vec::new()))
+}
+
+async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Answer {
+    let until = tokio::time::Instant::now() + wait_limit(request.wait_ms)?;
+    let mut changes = daemon.work.changes();
+    let mut drain = daemon.drain.subscribe();
+    let name = Some(request.collection.clone()).filter(|c| !c.is_empty());
+    loop {
+        let collection = name.clone();
+        let counted = blocking(daemon, move |d| reads::n_stale(d, collection.as_deref())).await;
+        let n_stale = match counted {
+            Ok(Ok(n)) => n,
+            Ok(Err(e)) => return Err(convert::library_error(&e)),
+            Err(panic) => return panicked(panic),
+        };
+        let n_queued = daemon.work.progress().n_live(name.as_deref()) as u64;
+        let idle = n_stale == 0 && n_queued == 0;
+        let over = idle || tokio::time::Instant::now() >= until || daemon.is_draining();
+        if over {
+            let reply = wire::WaitIdleReply { idle, n_queued, n_stale };
+            return Ok((reply::Result::WaitIdle(reply), Vec::new()));
+        }
+        // Shapes in work change their stage often; only the last one's end matters.
+        let pause = async {
+            if n_queued > 0 {
+                while daemon.work.progress().n_live(name.as_deref()) as u64 == n_queued
+                    && changes.changed().await.is_ok()
+                {}
+            } else {
+                let _ = changes.changed().await;
+            }
+        };
+        tokio::select! {
+            () = pause => {}
+            () = tokio::time::sleep_until(until) => {}
+            _ = drain.wait_for(|&d| d) => {}
+        }
+    }
+}

@@ -1,0 +1,347 @@
+//! The one thread that touches sockets: ROUTER for requests, PUB for events, an inproc PULL socket that
+//! wakes it when there is something to send.
+
+use crate::config::Limits;
+use crate::daemon::memory::{Budget, Reservation};
+use crate::daemon::{Counters, StartError};
+use crate::ipc::convert;
+use crate::ipc::endpoint::{Endpoint, claim_socket};
+use crate::ipc::frames::{self, FrameLimits};
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, Request, reply};
+use bytes::Bytes;
+use prost::Message as _;
+use std::os::unix::fs::PermissionsExt;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Raw frames of one message; a shape takes at most two.
+pub(crate) const MAX_FRAMES: usize = 1_024;
+/// Bytes of a header frame.
+pub(crate) const MAX_HEADER_BYTES: u64 = 4 << 20;
+/// Characters of the ids of a request.
+pub(crate) const MAX_ID_CHARS: usize = 128;
+/// Routing frames before the raw frames of a received message: identity, perhaps a delimiter, header.
+const N_LEADING: usize = 3;
+/// Messages that ZeroMQ keeps for one peer in each direction.
+const PEER_HWM: i32 = 256;
+/// Events that ZeroMQ keeps for one subscriber; beyond, the subscriber loses events and sees the gap.
+const SUBSCRIBER_HWM: i32 = 4_096;
+/// Bytes of a subscription; a topic is a collection's name.
+const MAX_SUBSCRIPTION_BYTES: i64 = 4_096;
+/// Milliseconds between heartbeats on a connection, and until a silent peer is given up.
+const HEARTBEAT_MS: i32 = 10_000;
+const HEARTBEAT_TIMEOUT_MS: i32 = 30_000;
+/// Milliseconds that closing waits for replies that are under way.
+const LINGER_MS: i32 = 1_000;
+/// Milliseconds after which the thread looks around even if nothing came, for the watchdog.
+const POLL_MS: i64 = 500;
+/// Requests read before replies get their turn.
+const READ_BATCH: usize = 64;
+/// What a client that finds the queue or the memory full should wait.
+pub(crate) const BUSY_RETRY_MS: u64 = 250;
+/// Owner and group may connect; the directory decides who gets that far.
+const SOCKET_MODE: u32 = 0o660;
+
+/// Where a reply goes.
+#[derive(Debug, Clone)]
+pub(crate) struct Peer {
+    identity: Bytes,
+    /// Whether the peer puts an empty frame before the header, as a REQ socket does.
+    delimiter: bool,
+}
+
+/// A request that arrived.
+pub(crate) struct Incoming {
+    pub(crate) peer: Peer,
+    pub(crate) request: Request,
+    pub(crate) frames: Vec<Bytes>,
+    pub(crate) received: Instant,
+    /// Given back when the request is dropped.
+    pub(crate) _memory: Reservation,
+}
+
+enum Outgoing {
+    Reply { peer: Peer, reply: Box<Reply>, frames: Vec<Bytes> },
+    Event { topic: Vec<u8>, body: Vec<u8> },
+    Stop,
+}
+
+/// Where the other threads leave what is to be sent.
+pub(crate) struct Outbox {
+    queue: mpsc::Sender<Outgoing>,
+    wake: Mutex<zmq::Socket>,
+}
+
+impl Outbox {
+    pub(crate) fn reply(&self, peer: Peer, reply: Reply, frames: Vec<Bytes>) {
+        self.push(Outgoing::Reply { peer, reply: Box::new(reply), frames });
+    }
+
+    pub(crate) fn event(&self, topic: Vec<u8>, body: Vec<u8>) {
+        self.push(Outgoing::Event { topic, body });
+    }
+
+    pub(crate) fn stop(&self) {
+        self.push(Outgoing::Stop);
+    }
+
+    fn push(&self, outgoing: Outgoing) {
+        // The thread is gone: so is whoever waits for this.
+        if self.queue.send(outgoing).is_err() {
+            return;
+        }
+        let wake = self.wake.lock().unwrap_or_else(PoisonError::into_inner);
+        match wake.send(zmq::Message::new(), zmq::DONTWAIT) {
+            // Full: a wake-up is under way already.
+            Ok(()) | Err(zmq::Error::EAGAIN) => {}
+            Err(e) => tracing::error!(error = %e, "the socket thread cannot be woken"),
+        }
+    }
+}
+
+/// Sockets that are bound but not yet served.
+pub(crate) struct Bound {
+    router: zmq::Socket,
+    publisher: zmq::Socket,
+    wake: zmq::Socket,
+    queue: mpsc::Receiver<Outgoing>,
+    pub(crate) outbox: Arc<Outbox>,
+    pub(crate) endpoint: Endpoint,
+    pub(crate) events: Endpoint,
+    locks: Vec<std::fs::File>,
+}
+
+/// Binds both endpoints.
+pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartError> {
+    endpoint.check_servable()?;
+    let context = zmq::Context::new();
+    let failed = |source| StartError::Socket { endpoint: endpoint.to_string(), source };
+    let sockets = || {
+        let router = context.socket(zmq::ROUTER)?;
+        router.set_router_mandatory(true)?;
+        router.set_maxmsgsize(i64::try_from(limits.max_message.0).unwrap_or(i64::MAX))?;
+        router.set_rcvhwm(PEER_HWM)?;
+        router.set_sndhwm(PEER_HWM)?;
+        let publisher = context.socket(zmq::PUB)?;
+        publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;
+        publisher.set_sndhwm(SUBSCRIBER_HWM)?;
+        for socket in [&router, &publisher] {
+            socket.set_linger(LINGER_MS)?;
+            socket.set_heartbeat_ivl(HEARTBEAT_MS)?;
+            socket.set_heartbeat_timeout(HEARTBEAT_TIMEOUT_MS)?;
+            socket.set_ipv6(true)?;
+        }
+        let (wake, wake_sender) = (context.socket(zmq::PULL)?, context.socket(zmq::PUSH)?);
+        wake.bind("inproc://wake")?;
+        wake_sender.connect("inproc://wake")?;
+        wake_sender.set_linger(0)?;
+        Ok((router, publisher, wake, wake_sender))
+    };
+    let (router, publisher, wake, wake_sender) = sockets().map_err(failed)?;
+    let mut locks = Vec::new();
+    let mut listen = |socket: &zmq::Socket, endpoint: &Endpoint| -> Result<Endpoint, StartError> {
+        if let Endpoint::Ipc(path) = endpoint {
+            locks.push(claim_socket(path)?);
+        }
+        let failed = |source| StartError::Socket { endpoint: endpoint.to_string(), source };
+        let uri = match endpoint {
+            Endpoint::Tcp { host, port: 0 } => format!("tcp://{host}:*"),
+            other => other.to_string(),
+        };
+        socket.bind(&uri).map_err(failed)?;
+        match endpoint {
+            Endpoint::Ipc(path) => {
+                std::fs::set_permissions(path, std::fs::Permissions::from_mode(SOCKET_MODE))
+                    .map_err(|_| failed(zmq::Error::EACCES))?;
+                Ok(endpoint.clone())
+            }
+            Endpoint::Tcp { .. } => {
+                let last = socket.get_last_endpoint().map_err(failed)?;
+                Ok(Endpoint::parse(&last.map_err(|_| failed(zmq::Error::EINVAL))?)?)
+            }
+        }
+    };
+    let endpoint = listen(&router, endpoint)?;
+    let events = listen(&publisher, &endpoint.events()?)?;
+    let (sender, queue) = mpsc::channel();
+    let outbox = Arc::new(Outbox { queue: sender, wake: Mutex::new(wake_sender) });
+    Ok(Bound { router, publisher, wake, queue, outbox, endpoint, events, locks })
+}
+
+/// What the socket thread shares with the daemon.
+pub(crate) struct Shared {
+    pub(crate) memory: Arc<Budget>,
+    pub(crate) counters: Arc<Counters>,
+    /// Advances while the thread lives.
+    pub(crate) tick: Arc<AtomicU64>,
+    pub(crate) max_message_bytes: u64,
+}
+
+/// Serves the sockets in a thread of their own until [`Outbox::stop`].
+pub(crate) fn serve(
+    bound: Bound,
+    shared: Shared,
+    requests: tokio::sync::mpsc::Sender<Incoming>,
+) -> std::io::Result<JoinHandle<()>> {
+    let limits = FrameLimits {
+        max_message_bytes: shared.max_message_bytes,
+        max_frames: MAX_FRAMES,
+        max_header_bytes: MAX_HEADER_BYTES,
+    };
+    let thread = SocketThread { bound, shared, requests, limits };
+    std::thread::Builder::new().name("sockets".to_owned()).spawn(move || thread.run())
+}
+
+struct SocketThread {
+    bound: Bound,
+    shared: Shared,
+    requests: tokio::sync::mpsc::Sender<Incoming>,
+    limits: FrameLimits,
+}
+
+impl SocketThread {
+    fn run(self) {
+        loop {
+            self.shared.tick.fetch_add(1, Ordering::Relaxed);
+            let mut items = [
+                self.bound.router.as_poll_item(zmq::POLLIN),
+                self.bound.wake.as_poll_item(zmq::POLLIN),
+            ];
+            match zmq::poll(&mut items, POLL_MS) {
+                Ok(_) | Err(zmq::Error::EINTR) => {}
+                Err(e) => {
+                    tracing::error!(error = %e, "the sockets cannot be polled");
+                    std::thread::sleep(Duration::from_millis(100));
+                }
+            }
+            while self.bound.wake.recv_msg(zmq::DONTWAIT).is_ok() {}
+            while let Ok(outgoing) = self.bound.queue.try_recv() {
+                match outgoing {
+                    Outgoing::Reply { peer, reply, frames } => self.reply(&peer, &reply, frames),
+                    Outgoing::Event { topic, body } => self.publish(topic, body),
+                    Outgoing::Stop => return,
+                }
+            }
+            for _ in 0..READ_BATCH {
+                match frames::receive(&self.bound.router, zmq::DONTWAIT, &self.limits, N_LEADING) {
+                    Ok(Ok(message)) => self.request(message),
+                    Ok(Err((leading, e))) => {
+                        let Some((peer, header, _)) = split(leading) else { continue };
+                        let id = Request::decode(header).unwrap_or_default().request_id;
+                        self.refuse(&peer, id, convert::frame_error(&e));
+                    }
+                    Err(zmq::Error::EAGAIN | zmq::Error::EINTR) => break,
+                    Err(e) => {
+                        tracing::error!(error = %e, "a request cannot be received");
+                        break;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Decodes, admits and hands over a message.
+    fn request(&self, message: Vec<Bytes>) {
+        let received = Instant::now();
+        let n_bytes = message.iter().map(|f| f.len() as u64).sum();
+        let Some((peer, header, frames)) = split(message) else { return };
+        let invalid = |reason, text: String| {
+            convert::error(ErrorCode::InvalidArgument, reason, text)
+        };
+        if header.len() as u64 > self.limits.max_header_bytes {
+            let text = format!(
+                "the header frame has {} bytes, the limit is {}",
+                header.len(),
+                self.limits.max_header_bytes
+            );
+            return self.refuse(&peer, String::new(), invalid(ErrorReason::MessageTooLarge, text));
+        }
+        let request = match Request::decode(header) {
+            Ok(request) => request,
+            Err(e) => {
+                let text = format!("the header frame is not a coseg.v1.Request: {e}");
+                let error = invalid(ErrorReason::MalformedMessage, text);
+                return self.refuse(&peer, String::new(), error);
+            }
+        };
+        for (field, id) in [("request_id", &request.request_id), ("client_id", &request.client_id)] {
+            let found = id.chars().count();
+            if found > MAX_ID_CHARS {
+                let text = format!("{field} has {found} characters, the limit is {MAX_ID_CHARS}");
+                let error = convert::field_error(ErrorReason::FieldRange, field, text);
+                return self.refuse(&peer, String::new(), error);
+            }
+        }
+        let Some(memory) = self.shared.memory.try_reserve(n_bytes) else {
+            let text = format!("requests in hand leave no memory for {n_bytes} bytes more");
+            return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
+        };
+        let incoming = Incoming { peer, request, frames, received, _memory: memory };
+        if let Err(refused) = self.requests.try_send(incoming) {
+            let incoming = refused.into_inner();
+            let text = "too many requests wait".to_owned();
+            let id = incoming.request.request_id;
+            self.busy(&incoming.peer, id, ErrorReason::QueueFull, text);
+        }
+    }
+
+    fn busy(&self, peer: &Peer, request_id: String, reason: ErrorReason, text: String) {
+        let mut error = convert::error(ErrorCode::ResourceExhausted, reason, text);
+        error.retry_after_ms = BUSY_RETRY_MS;
+        self.shared.counters.refused.fetch_add(1, Ordering::Relaxed);
+        self.refuse(peer, request_id, error);
+    }
+
+    fn refuse(&self, peer: &Peer, request_id: String, error: wire::Error) {
+        let reply = Reply { request_id, result: Some(reply::Result::Error(error)) };
+        self.reply(peer, &reply, Vec::new());
+    }
+
+    fn reply(&self, peer: &Peer, reply: &Reply, frames: Vec<Bytes>) {
+        self.shared.counters.requests.fetch_add(1, Ordering::Relaxed);
+        let mut parts = vec![zmq::Message::from(&peer.identity[..])];
+        if peer.delimiter {
+            parts.push(zmq::Message::new());
+        }
+        parts.push(zmq::Message::from(reply.encode_to_vec()));
+        parts.extend(frames.iter().map(|f| zmq::Message::from(&f[..])));
+        match frames::send(&self.bound.router, parts, zmq::DONTWAIT) {
+            Ok(()) => {}
+            Err(zmq::Error::EHOSTUNREACH) => {
+                tracing::debug!(request = reply.request_id, "the client left before its reply");
+            }
+            // It asks again under the same request id when it reads again.
+            Err(e) => tracing::warn!(request = reply.request_id, error = %e, "a reply was dropped"),
+        }
+    }
+
+    fn publish(&self, topic: Vec<u8>, body: Vec<u8>) {
+        let parts = vec![zmq::Message::from(topic), zmq::Message::from(body)];
+        if let Err(e) = frames::send(&self.bound.publisher, parts, zmq::DONTWAIT) {
+            // Subscribers see the gap and ask for the events.
+            tracing::warn!(error = %e, "an event was not published");
+        }
+    }
+}
+
+impl Drop for Bound {
+    fn drop(&mut self) {
+        // The locks outlive the sockets, whose files ZeroMQ removes when it unbinds.
+        let _ = self.router.unbind(&self.endpoint.to_string());
+        let _ = self.publisher.unbind(&self.events.to_string());
+        self.locks.clear();
+    }
+}
+
+/// Peer, header and raw frames of a message as a ROUTER socket receives it.
+fn split(message: Vec<Bytes>) -> Option<(Peer, Bytes, Vec<Bytes>)> {
+    let mut parts = message.into_iter().peekable();
+    let identity = parts.next()?;
+    let first = parts.next().unwrap_or_default();
+    // A DEALER's message with an empty header and frames would be a request without a body anyway.
+    let delimiter = first.is_empty() && parts.peek().is_some();
+    let header = if delimiter { parts.next()? } else { first };
+    Some((Peer { identity, delimiter }, header, parts.collect()))
+}

@@ -1,0 +1,420 @@
+//! Accepted shapes are described side by side and placed one after the other.
+//!
+//! One scheduler hands waiting shapes to describing threads, as many as there are workers and memory
+//! for, collections in turn. One lane for each collection places them strictly in order of acceptance,
+//! however the describing threads overtake each other. A lane with nothing to place relabels stale shapes.
+
+use crate::config::Limits;
+use crate::daemon::memory::Reservation;
+use crate::daemon::progress::{Progress, Waiting};
+use crate::daemon::publish::Notice;
+use crate::daemon::{Daemon, blocking, panic_text};
+use crate::ipc::convert;
+use crate::library::{Described, Failure, ItemState, Job, JobItem, LibraryError};
+use crate::pipeline::Description;
+use crate::store::StoreError;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+use tokio::task::JoinSet;
+
+/// What describing came to.
+type Outcome = Result<Described, Failure>;
+
+/// A shape on its way to its lane.
+enum Prepared {
+    /// It was described, or failed to be.
+    Described(Outcome),
+    /// When its turn to be described came, no description was needed: the same bytes were there under its
+    /// name, or others that it may not replace. Looked at again when its turn to be placed comes.
+    NotNeeded,
+}
+
+/// What a lane is told.
+pub(crate) enum Step {
+    /// Place this shape after all before it.
+    Place(Ready),
+    /// Some labels may have become stale.
+    Relabel,
+}
+
+/// A shape whose description is under way.
+pub(crate) struct Ready {
+    item: JobItem,
+    /// Dropped without a value if the daemon drains: the shape stays queued in the catalog.
+    prepared: oneshot::Receiver<(Prepared, Reservation)>,
+}
+
+/// Delay before a failed write is tried again, doubled each time.
+const FIRST_RETRY: Duration = Duration::from_secs(1);
+const LAST_RETRY: Duration = Duration::from_secs(30);
+
+/// The work in hand.
+pub(crate) struct Work {
+    progress: Mutex<Progress<Step>>,
+    /// A shape waits to be described.
+    arrived: Notify,
+    /// Advances with every change, for those who wait for one.
+    changes: watch::Sender<u64>,
+    lanes: Mutex<JoinSet<()>>,
+}
+
+impl Work {
+    pub(crate) fn new() -> Self {
+        Self {
+            progress: Mutex::new(Progress::new()),
+            arrived: Notify::new(),
+            changes: watch::Sender::new(0),
+            lanes: Mutex::new(JoinSet::new()),
+        }
+    }
+
+    pub(crate) fn progress(&self) -> MutexGuard<'_, Progress<Step>> {
+        // Nothing in `Progress` panics half-way but for broken invariants, which are reported.
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Told of every change from now on.
+    pub(crate) fn changes(&self) -> watch::Receiver<u64> {
+        self.changes.subscribe()
+    }
+
+    fn changed(&self) {
+        self.changes.send_modify(|n| *n += 1);
+    }
+}
+
+impl Daemon {
+    /// Takes up the shapes of a job that was accepted, unless it was taken up before.
+    pub(crate) fn take_up(self: &Arc<Self>, job: &Job, n_bytes: &[u64]) {
+        if self.work.progress().is_known(job.id) {
+            return;
+        }
+        let items = job.items.iter().zip(n_bytes);
+        self.take_up_items(
+            items.map(|(item, &n_bytes)| Waiting { item: item.clone(), n_bytes }).collect(),
+        );
+    }
+
+    /// Takes up shapes in the order given.
+    pub(crate) fn take_up_items(self: &Arc<Self>, items: Vec<Waiting>) {
+        for waiting in items {
+            if convert::job_finished(&waiting.item.state) {
+                continue;
+            }
+            self.ensure_lane(&waiting.item.collection);
+            self.work.progress().push(waiting);
+        }
+        self.work.changed();
+        self.work.arrived.notify_one();
+    }
+
+    /// Something that may make labels stale was committed to the collection.
+    pub(crate) fn nudge(self: &Arc<Self>, collection: &str) {
+        self.ensure_lane(collection);
+        if let Some(lane) = self.work.progress().lane(collection) {
+            // A lane ends only when the daemon does.
+            let _ = lane.send(Step::Relabel);
+        }
+        self.work.changed();
+    }
+
+    fn ensure_lane(self: &Arc<Self>, collection: &str) {
+        let mut progress = self.work.progress();
+        if self.is_draining() || progress.lane(collection).is_some() {
+            return;
+        }
+        let (sender, receiver) = mpsc::unbounded_channel();
+        progress.add_lane(collection, sender);
+        let lane = place_in_order(Arc::clone(self), collection.to_owned(), receiver);
+        let mut lanes = self.work.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        while lanes.try_join_next().is_some() {}
+        lanes.spawn(lane);
+    }
+
+    /// Cancels what is not placed of a job, after the catalog did.
+    pub(crate) fn forget_cancelled(&self, job: &Job) {
+        let mut progress = self.work.progress();
+        progress.cancel(job.id);
+        progress.drop_waiting(job.id, |index| {
+            job.items.iter().any(|i| i.index == index && convert::job_finished(&i.state))
+        });
+        drop(progress);
+        self.work.changed();
+    }
+
+    /// Waits until every lane has ended. For draining: the lanes must have been closed.
+    pub(crate) async fn lanes_ended(&self) {
+        let mut lanes =
+            std::mem::take(&mut *self.work.lanes.lock().unwrap_or_else(PoisonError::into_inner));
+        while lanes.join_next().await.is_some() {}
+    }
+}
+
+/// Hands waiting shapes to describing threads until the daemon drains.
+pub(crate) async fn schedule(daemon: Arc<Daemon>) {
+    let mut draining = daemon.drain.subscribe();
+    tokio::select! {
+        () = hand_out(&daemon) => {}
+        _ = draining.wait_for(|&d| d) => {}
+    }
+    daemon.work.progress().close();
+}
+
+async fn hand_out(daemon: &Arc<Daemon>) {
+    loop {
+        let worker = Arc::clone(&daemon.workers).acquire_owned().await;
+        let worker = worker.expect("invariant: the semaphore is never closed");
+        let (waiting, lane) = loop {
+            let arrived = daemon.work.arrived.notified();
+            // Not in the match: the lock must not be held while waiting.
+            let next = daemon.work.progress().pop();
+            match next {
+                Some(next) => break next,
+                None => arrived.await,
+            }
+        };
+        let memory = daemon.describe_memory.reserve(Limits::to_describe(waiting.n_bytes)).await;
+        let (sender, prepared) = oneshot::channel();
+        // Told before describing begins, so that the lane has its shapes in order of acceptance.
+        if lane.send(Step::Place(Ready { item: waiting.item.clone(), prepared })).is_err() {
+            continue;
+        }
+        let daemon = Arc::clone(daemon);
+        tokio::task::spawn_blocking(move || {
+            let mut memory = memory;
+            let prepared = prepare(&daemon, &waiting.item);
+            drop(worker);
+            match &prepared {
+                Prepared::Described(Ok(d)) => memory.shrink_to(bytes_of(&d.description)),
+                Prepared::NotNeeded => memory.shrink_to(0),
+                Prepared::Described(Err(_)) => {
+                    memory.shrink_to(0);
+                    // Stopped, it seems: it is described again at the next start.
+                    if daemon.is_draining() {
+                        return;
+                    }
+                }
+            }
+            // The lane is gone only if the daemon drains.
+            let _ = sender.send((prepared, memory));
+        });
+    }
+}
+
+fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
+    match daemon.library.needs_description(item) {
+        Ok(false) => Prepared::NotNeeded,
+        Ok(true) => Prepared::Described(describe(daemon, item)),
+        Err(e) => Prepared::Described(Err(convert::library_failure(&e))),
+    }
+}
+
+/// Describes one shape; a panic is that shape's failure.
+fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
+    let begin = Instant::now();
+    let limit = Duration::from_secs(daemon.config().work.shape_seconds);
+    let stage = |name: &str| {
+        daemon.work.progress().set_stage(item, name);
+        daemon.work.changed();
+        !daemon.is_draining()
+            && begin.elapsed() < limit
+            && !daemon.work.progress().is_cancelled(item.job)
+    };
+    let outcome = catch_unwind(AssertUnwindSafe(|| daemon.library.describe_item(item, &stage)));
+    match outcome {
+        Ok(Ok(described)) => Ok(described),
+        Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
+        Ok(Err(_)) if begin.elapsed() >= limit => {
+            let (found, limit) = (begin.elapsed().as_secs_f64(), limit.as_secs());
+            let message = format!("describing it took {found:.0} s, the limit is {limit} s");
+            Err(failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message))
+        }
+        Ok(Err(failure)) => Err(failure),
+        Err(panic) => Err(panicked(&panic_text(panic.as_ref()))),
+    }
+}
+
+/// Bytes that a description holds until it is placed.
+fn bytes_of(d: &Description) -> u64 {
+    let floats = d.mass.len()
+        + d.eigenvectors.len()
+        + d.hks.len()
+        + d.face_descriptors.len()
+        + d.polygon_area.len()
+        + d.signature.len();
+    let integers = d.patches.len() + d.face_map.len();
+    let triples = d.vertices.len() + d.faces.len();
+    (4 * (floats + integers) + 12 * triples + 8 * d.eigenvalues.len()) as u64
+}
+
+fn failed(code: &str, reason: &str, message: String) -> Failure {
+    Failure { code: code.to_owned(), reason: reason.to_owned(), message, subject: None }
+}
+
+fn cancelled() -> Failure {
+    let message = "the job was cancelled before this shape was placed".to_owned();
+    failed("CANCELLED", "CANCELLED", message)
+}
+
+fn panicked(text: &str) -> Failure {
+    failed("INTERNAL", "PANIC", format!("the work on this shape panicked: {text}"))
+}
+
+/// A collection's lane.
+async fn place_in_order(
+    daemon: Arc<Daemon>,
+    collection: String,
+    mut steps: mpsc::UnboundedReceiver<Step>,
+) {
+    let mut relabel = true;
+    loop {
+        let step = match steps.try_recv() {
+            Ok(step) => step,
+            Err(mpsc::error::TryRecvError::Empty) if relabel => {
+                relabel = relabel_next(&daemon, &collection).await;
+                continue;
+            }
+            Err(_) => match steps.recv().await {
+                Some(step) => step,
+                None => return,
+            },
+        };
+        let mut ready = match step {
+            Step::Place(ready) => ready,
+            Step::Relabel => {
+                relabel = true;
+                continue;
+            }
+        };
+        let prepared = loop {
+            match ready.prepared.try_recv() {
+                Ok(prepared) => break Ok(prepared),
+                Err(oneshot::error::TryRecvError::Empty) if relabel => {
+                    relabel = relabel_next(&daemon, &collection).await;
+                }
+                Err(_) => break (&mut ready.prepared).await,
+            }
+        };
+        // Draining: this shape and all after it stay queued.
+        let Ok((prepared, _memory)) = prepared else { return };
+        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else { return };
+        if !place(&daemon, &ready.item, outcome).await {
+            return;
+        }
+        relabel = true;
+    }
+}
+
+/// What is to be placed, now that all before it are. `None`: the daemon drains.
+async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
+    if let Prepared::Described(outcome) = prepared {
+        return Some(outcome);
+    }
+    let subject = item.clone();
+    // A shape before it may have removed the reason why no description was needed.
+    let settled = blocking(daemon, move |d| match prepare(d, &subject) {
+        Prepared::Described(outcome) => outcome,
+        // The library sees by itself why, before it looks at this.
+        Prepared::NotNeeded => Err(failed("INTERNAL", "GONE", "it was not described".to_owned())),
+    });
+    let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
+    (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
+}
+
+/// Places one shape and commits. False: the daemon drains and the shape stays queued.
+async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bool {
+    if daemon.work.progress().is_cancelled(item.job) {
+        outcome = Err(cancelled());
+    }
+    daemon.work.progress().set_stage(item, "place");
+    daemon.work.changed();
+    let mut delay = FIRST_RETRY;
+    let mut draining = daemon.drain.subscribe();
+    loop {
+        let (again, subject) = (outcome.clone(), item.clone());
+        let placed = blocking(daemon, move |d| d.library.place_item(&subject, again)).await;
+        let failure = match placed {
+            Ok(Ok(state)) => {
+                report(daemon, item, &state);
+                break;
+            }
+            // Nothing was written: there may be space again, or a restart, and the shape is still queued.
+            Ok(Err(LibraryError::Store(
+                e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
+            ))) => {
+                tracing::error!(
+                    collection = item.collection, shape = item.name, error = %e,
+                    "a shape cannot be stored; trying again in {} s", delay.as_secs()
+                );
+                tokio::select! {
+                    () = tokio::time::sleep(delay) => {}
+                    _ = draining.wait_for(|&d| d) => return false,
+                }
+                delay = (delay * 2).min(LAST_RETRY);
+                continue;
+            }
+            Ok(Err(e)) => convert::library_failure(&e),
+            Err(panic) => panicked(&panic),
+        };
+        if outcome.is_err() {
+            // Not even the failure can be recorded: the collection or the job is gone.
+            tracing::warn!(
+                collection = item.collection, shape = item.name, job = item.job,
+                message = failure.message, "a shape was dropped"
+            );
+            break;
+        }
+        outcome = Err(failure);
+    }
+    daemon.work.progress().finish(item);
+    daemon.work.changed();
+    daemon.notice(Notice::Changed(item.collection.clone()));
+    true
+}
+
+fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
+    let (collection, shape) = (&item.collection, &item.name);
+    match state {
+        ItemState::Done(placed) => tracing::info!(
+            collection, shape, outcome = ?placed.outcome, version = placed.version,
+            ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
+        ),
+        ItemState::Failed(f) => {
+            daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(collection, shape, code = f.code, reason = f.reason, message = f.message, "failed");
+        }
+        ItemState::Cancelled => tracing::info!(collection, shape, "cancelled"),
+        ItemState::Queued | ItemState::Running(_) => {
+            tracing::error!(collection, shape, "was placed but is not over");
+        }
+    }
+}
+
+/// Relabels one stale shape of the collection. False: none was stale, or not now.
+async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
+    if daemon.is_draining() {
+        return false;
+    }
+    let name = collection.to_owned();
+    let relabelled = blocking(daemon, move |d| d.library.relabel_next(Some(&name))).await;
+    let again = match relabelled {
+        Ok(Ok(again)) => again,
+        Ok(Err(LibraryError::NotFound { .. })) => false,
+        Ok(Err(e)) => {
+            tracing::error!(collection, error = %e, "a stale shape cannot be relabelled");
+            false
+        }
+        Err(panic) => {
+            tracing::error!(collection, panic, "relabelling panicked");
+            false
+        }
+    };
+    if again {
+        daemon.notice(Notice::Changed(collection.to_owned()));
+    }
+    daemon.work.changed();
+    again
+}

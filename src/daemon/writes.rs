@@ -1,0 +1,217 @@
+//! Requests that change something, carried out one after the other.
+
+use crate::config;
+use crate::daemon::Daemon;
+use crate::daemon::publish::Notice;
+use crate::daemon::requests::draining;
+use crate::daemon::service::Control;
+use crate::ipc::convert;
+use crate::ipc::endpoint::Endpoint;
+use crate::ipc::frames::FrameReader;
+use crate::ipc::wire::{
+    self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body,
+};
+use crate::library::{LibraryError, RequestKey};
+use bytes::Bytes;
+use std::io::Read as _;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+/// Milliseconds after which a queue of shapes that is full is worth another try.
+const QUEUE_RETRY_MS: u64 = 1_000;
+
+/// How a change is answered.
+pub(crate) enum Done {
+    /// With this.
+    Now(Reply),
+    /// With this job, once it is finished.
+    WhenPlaced(u64),
+}
+
+/// The idempotency key of a request, if its client has a name.
+pub(crate) fn key(request: &wire::Request) -> Option<RequestKey> {
+    (!request.client_id.is_empty()).then(|| RequestKey {
+        client_id: request.client_id.clone(),
+        request_id: request.request_id.clone(),
+    })
+}
+
+/// Carries out one change, durably.
+pub(crate) fn change(
+    daemon: &Arc<Daemon>,
+    body: &Body,
+    frames: &[Bytes],
+    key: Option<&RequestKey>,
+) -> Result<Done, wire::Error> {
+    if let Body::Drain(_) = body {
+        return drain(daemon).map(Done::Now);
+    }
+    if daemon.is_draining() {
+        return Err(draining());
+    }
+    if key.is_some_and(|k| k.request_id.is_empty()) {
+        let text = "a change by a named client needs a request_id";
+        return Err(convert::field_error(ErrorReason::FieldMissing, "request_id", text));
+    }
+    let library = &daemon.library;
+    let reply = match body {
+        Body::CreateCollection(r) => {
+            let spec = r.spec.as_ref().ok_or_else(|| {
+                convert::field_error(ErrorReason::FieldMissing, "spec", "spec is missing")
+            })?;
+            let spec = convert::collection_spec(spec, "spec")?;
+            let info = library.create_collection(&spec, key).map_err(refuse)?;
+            daemon.notice(Notice::Created(spec.name, info.sequence));
+            let collection = Some(convert::collection(&info));
+            Reply::CreateCollection(wire::CreateCollectionReply { collection })
+        }
+        Body::DeleteCollection(r) => {
+            library.delete_collection(&r.collection, key).map_err(refuse)?;
+            daemon.work.progress().remove_idle_lane(&r.collection);
+            daemon.notice(Notice::Changed(r.collection.clone()));
+            Reply::DeleteCollection(wire::DeleteCollectionReply {})
+        }
+        Body::NameLabel(r) => {
+            let label =
+                library.name_label(&r.collection, r.label, &r.name, key).map_err(refuse)?;
+            daemon.notice(Notice::Changed(r.collection.clone()));
+            Reply::NameLabel(wire::NameLabelReply { label: Some(convert::label_info(&label)) })
+        }
+        Body::RemoveShape(r) => {
+            library.remove(&r.collection, &r.shape, key).map_err(refuse)?;
+            daemon.notice(Notice::Changed(r.collection.clone()));
+            // Those that carried its labels over may be stale now.
+            daemon.nudge(&r.collection);
+            Reply::RemoveShape(wire::RemoveShapeReply {})
+        }
+        Body::CancelJob(r) => {
+            let job = library.cancel(r.job_id).map_err(refuse)?;
+            daemon.forget_cancelled(&job);
+            Reply::CancelJob(wire::CancelJobReply { job: Some(daemon.job_to_wire(&job)) })
+        }
+        Body::AddShapes(r) => return add_shapes(daemon, r, frames, key),
+        other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
+    };
+    Ok(Done::Now(reply))
+}
+
+fn refuse(e: LibraryError) -> wire::Error {
+    convert::library_error(&e)
+}
+
+fn drain(daemon: &Daemon) -> Result<Reply, wire::Error> {
+    if let Endpoint::Tcp { .. } = daemon.endpoint {
+        return Err(convert::error(
+            ErrorCode::PermissionDenied,
+            ErrorReason::AdminIpcOnly,
+            "only a client on an ipc endpoint may drain the daemon",
+        ));
+    }
+    let n_queued = daemon.work.progress().n_live(None) as u64;
+    // The main thread is gone: the daemon is ending already.
+    let _ = daemon.asked_to_drain.send(Control::Drain);
+    Ok(Reply::Drain(wire::DrainReply { n_queued }))
+}
+
+fn add_shapes(
+    daemon: &Arc<Daemon>,
+    request: &wire::AddShapesRequest,
+    frames: &[Bytes],
+    key: Option<&RequestKey>,
+) -> Result<Done, wire::Error> {
+    let config = daemon.config();
+    let (limits, roots) = (&config.limits, &config.ingest.paths);
+    let n = request.shapes.len();
+    let n_queued = daemon.work.progress().n_live(None);
+    if n <= limits.max_shapes_per_request && n_queued + n > limits.max_queued_shapes {
+        let text = format!(
+            "{n_queued} shapes are queued and {n} more asked for, the limit is {}",
+            limits.max_queued_shapes
+        );
+        let mut error =
+            convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, text);
+        error.retry_after_ms = QUEUE_RETRY_MS;
+        daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+        return Err(error);
+    }
+    let max_shape_bytes = limits.shape_bytes();
+    let read_path = |path: &Path| read_allowed(path, roots, max_shape_bytes);
+    let ingest = convert::Ingest {
+        max_shapes: limits.max_shapes_per_request,
+        max_shape_bytes,
+        read_path: &read_path,
+    };
+    let shapes = convert::new_shapes(request, FrameReader::new(frames), &ingest)?;
+    if let Some(create) = &request.create {
+        ensure_collection(daemon, &request.collection, create)?;
+    }
+    let n_bytes: Vec<u64> = shapes.iter().map(|s| s.bytes.len() as u64).collect();
+    let job = daemon.library.submit(&request.collection, shapes, key).map_err(refuse)?;
+    daemon.take_up(&job, &n_bytes);
+    match request.mode() {
+        wire::AddMode::Wait => Ok(Done::WhenPlaced(job.id)),
+        wire::AddMode::Job | wire::AddMode::Unspecified => {
+            Ok(Done::Now(Reply::AddShapes(convert::add_shapes(job.id, job.items.len(), None))))
+        }
+    }
+}
+
+/// Creates the collection if it is missing, or compares it with what the request states.
+fn ensure_collection(
+    daemon: &Arc<Daemon>,
+    name: &str,
+    wish: &wire::CollectionSpec,
+) -> Result<(), wire::Error> {
+    if !wish.name.is_empty() && wish.name != name {
+        let text = format!("create.name is {:?}, but collection is {name:?}", wish.name);
+        return Err(convert::field_error(ErrorReason::FieldRange, "create.name", text));
+    }
+    let named = wire::CollectionSpec { name: name.to_owned(), ..wish.clone() };
+    let spec = convert::collection_spec(&named, "create")?;
+    match daemon.library.collection(name) {
+        Ok(is) => match convert::collection_differs(&named, &is.spec) {
+            None => Ok(()),
+            Some((setting, wish, is)) => {
+                let text = format!("collection {name:?} has {setting} {is}, not {wish}");
+                let code = ErrorCode::FailedPrecondition;
+                Err(convert::error(code, ErrorReason::CollectionDiffers, text))
+            }
+        },
+        Err(LibraryError::NotFound { .. }) => {
+            let info = daemon.library.create_collection(&spec, None).map_err(refuse)?;
+            daemon.notice(Notice::Created(name.to_owned(), info.sequence));
+            Ok(())
+        }
+        Err(e) => Err(refuse(e)),
+    }
+}
+
+/// The bytes of a file below one of `roots`.
+fn read_allowed(
+    path: &Path,
+    roots: &[std::path::PathBuf],
+    max_bytes: u64,
+) -> Result<Vec<u8>, wire::Error> {
+    let forbidden = || {
+        let text = format!("{} is not below a directory of ingest.paths", path.display());
+        convert::error(ErrorCode::PermissionDenied, ErrorReason::PathForbidden, text)
+    };
+    if !path.is_absolute() || !config::is_below(path, roots) {
+        return Err(forbidden());
+    }
+    let unreadable = |text: String| {
+        convert::error(ErrorCode::InvalidArgument, ErrorReason::PathUnreadable, text)
+    };
+    let io = |e: std::io::Error| unreadable(format!("{}: {e}", path.display()));
+    let resolved = path.canonicalize().map_err(io)?;
+    // A pipe or a device could block for ever or never end.
+    if !std::fs::metadata(&resolved).map_err(io)?.is_file() {
+        return Err(unreadable(format!("{} is not a regular file", path.display())));
+    }
+    let file = std::fs::File::open(&resolved).map_err(io)?;
+    let mut bytes = Vec::new();
+    // One byte more shows that the file is too large.
+    file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(io)?;
+    Ok(bytes)
+}

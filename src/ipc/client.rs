@@ -1,0 +1,291 @@
+//! A blocking client: one request out, its reply back, the same request again when no answer came.
+
+use crate::ipc::endpoint::{Endpoint, EndpointError};
+use crate::ipc::frames::{self, FrameLimits};
+use crate::ipc::wire::{self, Reply, Request, reply, request};
+use bytes::Bytes;
+use prost::Message as _;
+use std::time::{Duration, Instant};
+
+/// How long a client waits for an answer unless told otherwise.
+pub const DEFAULT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Tries within the timeout: the second one on a new connection, should the first have been lost.
+const TRIES: u32 = 2;
+/// Milliseconds a socket that is closed goes on sending.
+const LINGER_MS: i32 = 0;
+/// What a client accepts of a reply; the daemon's own limits are on requests.
+const REPLY_LIMITS: FrameLimits = FrameLimits {
+    max_message_bytes: 4 << 30,
+    max_frames: 1 << 20,
+    max_header_bytes: 256 << 20,
+};
+
+/// Why a request has no result.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)]
+pub enum ClientError {
+    #[error("no answer from {endpoint} within {} s; is a daemon running there?", timeout.as_secs_f64())]
+    NoAnswer { endpoint: String, timeout: Duration },
+    #[error(transparent)]
+    Endpoint(#[from] EndpointError),
+    #[error("{}", .0.message)]
+    Refused(Box<wire::Error>),
+    #[error("the message has {found} {what}, the daemon's limit is {limit}")]
+    TooLarge { what: &'static str, found: u64, limit: u64 },
+    #[error("the daemon's reply cannot be understood: {0}")]
+    BadReply(String),
+    #[error("{endpoint}: {source}")]
+    Socket { endpoint: String, source: zmq::Error },
+}
+
+/// A reply's result and its raw frames.
+pub type Answer = (reply::Result, Vec<Bytes>);
+
+/// A connection to a daemon. Requests are answered one at a time.
+pub struct Client {
+    context: zmq::Context,
+    socket: zmq::Socket,
+    endpoint: Endpoint,
+    client_id: String,
+    n_requests: u64,
+    timeout: Duration,
+    hello: Option<wire::HelloReply>,
+}
+
+impl Client {
+    /// Connects to `uri`. That somebody listens there shows with the first request.
+    pub fn connect(uri: &str, timeout: Duration) -> Result<Self, ClientError> {
+        let endpoint = Endpoint::parse(uri)?;
+        let context = zmq::Context::new();
+        let socket = dealer(&context, &endpoint)?;
+        // Unique among all clients of all time: two runs must not share idempotency keys.
+        let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        let nanos = since.map_or(0, |d| d.as_nanos());
+        let client_id = format!("rust-{}-{nanos:x}", std::process::id());
+        Ok(Self { context, socket, endpoint, client_id, n_requests: 0, timeout, hello: None })
+    }
+
+    /// Takes another name than the unique one made up by [`Client::connect`], for callers that repeat
+    /// requests across processes.
+    pub fn set_client_id(&mut self, client_id: impl Into<String>) {
+        self.client_id = client_id.into();
+    }
+
+    /// How long an answer is waited for.
+    pub fn timeout(&self) -> Duration {
+        self.timeout
+    }
+
+    /// Where the daemon is.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.endpoint
+    }
+
+    /// Sends a request and waits for its result; an error reply is [`ClientError::Refused`].
+    pub fn call(&mut self, body: request::Body, frames: Vec<Bytes>) -> Result<Answer, ClientError> {
+        self.n_requests += 1;
+        let request_id = self.n_requests.to_string();
+        self.call_as(&request_id, body, frames)
+    }
+
+    /// The same under a request id of the caller's choice: the same id again is the same request.
+    pub fn call_as(
+        &mut self,
+        request_id: &str,
+        body: request::Body,
+        frames: Vec<Bytes>,
+    ) -> Result<Answer, ClientError> {
+        let request = Request {
+            request_id: request_id.to_owned(),
+            client_id: self.client_id.clone(),
+            deadline_ms: 0,
+            body: Some(body),
+        };
+        let header = request.encode_to_vec();
+        self.check_limits(&header, &frames)?;
+        let deadline = Instant::now() + self.timeout;
+        for attempt in 1..=TRIES {
+            if attempt > 1 {
+                self.socket = dealer(&self.context, &self.endpoint)?;
+            }
+            let until = deadline - self.timeout / TRIES * (TRIES - attempt);
+            if let Some((reply, frames)) = self.exchange(&header, &frames, request_id, until)? {
+                return match reply.result {
+                    Some(reply::Result::Error(e)) => Err(ClientError::Refused(Box::new(e))),
+                    Some(result) => Ok((result, frames)),
+                    None => Err(ClientError::BadReply("it has no result".to_owned())),
+                };
+            }
+        }
+        Err(ClientError::NoAnswer { endpoint: self.endpoint.to_string(), timeout: self.timeout })
+    }
+
+    /// The same, but a daemon that is at a limit is asked again after the delay it names, for as long
+    /// as it answers.
+    pub fn call_patiently(
+        &mut self,
+        body: &request::Body,
+        frames: &[Bytes],
+    ) -> Result<Answer, ClientError> {
+        self.n_requests += 1;
+        let request_id = self.n_requests.to_string();
+        loop {
+            match self.call_as(&request_id, body.clone(), frames.to_vec()) {
+                Err(ClientError::Refused(e))
+                    if e.code() == wire::ErrorCode::ResourceExhausted && e.retry_after_ms > 0 =>
+                {
+                    std::thread::sleep(Duration::from_millis(e.retry_after_ms));
+                }
+                other => return other,
+            }
+        }
+    }
+
+    /// Who the daemon is; asked once.
+    pub fn hello(&mut self) -> Result<&wire::HelloReply, ClientError> {
+        if self.hello.is_none() {
+            let body = request::Body::Hello(wire::HelloRequest {});
+            match self.call(body, Vec::new())?.0 {
+                reply::Result::Hello(hello) => self.hello = Some(hello),
+                other => return Err(unexpected(&other)),
+            }
+        }
+        Ok(self.hello.as_ref().expect("invariant: set above"))
+    }
+
+    /// A socket that receives the events of `collection`, or of all, and heartbeats.
+    pub fn subscribe(&mut self, collection: Option<&str>) -> Result<zmq::Socket, ClientError> {
+        let endpoint = self.hello()?.event_endpoint.clone();
+        let socket_error =
+            |source| ClientError::Socket { endpoint: endpoint.clone(), source };
+        let socket = self.context.socket(zmq::SUB).map_err(socket_error)?;
+        let subscribe = || {
+            socket.set_linger(LINGER_MS)?;
+            match collection {
+                Some(name) => {
+                    socket.set_subscribe(&crate::ipc::topic(name))?;
+                    socket.set_subscribe(crate::ipc::HEARTBEAT_TOPIC)?;
+                }
+                None => socket.set_subscribe(b"")?,
+            }
+            socket.connect(&endpoint)
+        };
+        subscribe().map_err(socket_error)?;
+        Ok(socket)
+    }
+
+    fn check_limits(&self, header: &[u8], frames: &[Bytes]) -> Result<(), ClientError> {
+        let Some(limits) = self.hello.as_ref().and_then(|h| h.limits.as_ref()) else {
+            return Ok(());
+        };
+        let n_bytes = header.len() as u64 + frames.iter().map(|f| f.len() as u64).sum::<u64>();
+        for (what, found, limit) in [
+            ("bytes", n_bytes, limits.max_message_bytes),
+            ("frames", frames.len() as u64, u64::from(limits.max_frames)),
+            ("bytes of header", header.len() as u64, limits.max_header_bytes),
+        ] {
+            if found > limit {
+                return Err(ClientError::TooLarge { what, found, limit });
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends once and waits for the reply to `request_id` until `until`; replies to earlier requests
+    /// are dropped.
+    fn exchange(
+        &self,
+        header: &[u8],
+        frames: &[Bytes],
+        request_id: &str,
+        until: Instant,
+    ) -> Result<Option<(Reply, Vec<Bytes>)>, ClientError> {
+        let socket_error =
+            |source| ClientError::Socket { endpoint: self.endpoint.to_string(), source };
+        let parts = std::iter::once(header).chain(frames.iter().map(AsRef::as_ref));
+        let left = |until: Instant| {
+            let ms = until.saturating_duration_since(Instant::now()).as_millis();
+            i32::try_from(ms).unwrap_or(i32::MAX)
+        };
+        self.socket.set_sndtimeo(left(until)).map_err(socket_error)?;
+        match frames::send(&self.socket, parts.map(zmq::Message::from).collect(), 0) {
+            Ok(()) => {}
+            Err(zmq::Error::EAGAIN) => return Ok(None),
+            Err(e) => return Err(socket_error(e)),
+        }
+        loop {
+            self.socket.set_rcvtimeo(left(until)).map_err(socket_error)?;
+            let message = match frames::receive(&self.socket, 0, &REPLY_LIMITS, 1) {
+                Ok(Ok(message)) => message,
+                Ok(Err((_, e))) => return Err(ClientError::BadReply(e.to_string())),
+                Err(zmq::Error::EAGAIN) => return Ok(None),
+                Err(zmq::Error::EINTR) => continue,
+                Err(e) => return Err(socket_error(e)),
+            };
+            let mut frames = message.into_iter();
+            let header = frames.next().unwrap_or_default();
+            let reply = Reply::decode(header).map_err(|e| ClientError::BadReply(e.to_string()))?;
+            if reply.request_id == request_id {
+                return Ok(Some((reply, frames.collect())));
+            }
+        }
+    }
+}
+
+fn dealer(context: &zmq::Context, endpoint: &Endpoint) -> Result<zmq::Socket, ClientError> {
+    let connect = || {
+        let socket = context.socket(zmq::DEALER)?;
+        socket.set_linger(LINGER_MS)?;
+        // Nothing is queued for a daemon that is not there.
+        socket.set_immediate(true)?;
+        socket.connect(&endpoint.to_string())?;
+        Ok(socket)
+    };
+    connect().map_err(|source| ClientError::Socket { endpoint: endpoint.to_string(), source })
+}
+
+/// A reply whose result does not belong to the request.
+pub fn unexpected(result: &reply::Result) -> ClientError {
+    let text = format!("{result:?}");
+    let name = text.split(['(', ' ']).next().unwrap_or_default();
+    ClientError::BadReply(format!("an unexpected {name}"))
+}
+
+/// Calls, and takes the result of the variant named.
+///
+/// `call!(client, Hello(HelloRequest {}))` is the `HelloReply`, and with `, frames` at the end the pair
+/// of the reply and its raw frames.
+#[macro_export]
+macro_rules! call {
+    ($client:expr, $variant:ident($body:expr)) => {
+        $crate::call!($client, $variant($body), Vec::new(), with_frames).map(|(reply, _)| reply)
+    };
+    ($client:expr, $variant:ident($body:expr), frames) => {
+        $crate::call!($client, $variant($body), Vec::new(), with_frames)
+    };
+    ($client:expr, $variant:ident($body:expr), $frames:expr, with_frames) => {
+        match $client.call($crate::ipc::wire::request::Body::$variant($body), $frames) {
+            Ok(($crate::ipc::wire::reply::Result::$variant(reply), frames)) => Ok((reply, frames)),
+            Ok((other, _)) => Err($crate::ipc::client::unexpected(&other)),
+            Err(e) => Err(e),
+        }
+    };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Client, ClientError};
+    use std::time::{Duration, Instant};
+
+    #[test]
+    fn a_client_without_a_daemon_gives_up_in_time() {
+        let directory = tempfile::tempdir().unwrap();
+        let uri = format!("ipc://{}/s", directory.path().display());
+        let begin = Instant::now();
+        let timeout = Duration::from_millis(200);
+        let mut client = Client::connect(&uri, timeout).unwrap();
+        assert!(matches!(client.hello(), Err(ClientError::NoAnswer { .. })));
+        assert!(begin.elapsed() >= timeout - Duration::from_millis(5));
+        assert!(begin.elapsed() < Duration::from_secs(3));
+    }
+}

@@ -1,0 +1,186 @@
+//! Collections and labels.
+
+use super::errors::field_error;
+use crate::ipc::wire;
+use crate::library::{CollectionInfo, CollectionSpec, LabelInfo, Up};
+use crate::operators::Operator;
+
+fn up_to_wire(up: Up) -> wire::Up {
+    match up {
+        Up::PlusX => wire::Up::PlusX,
+        Up::MinusX => wire::Up::MinusX,
+        Up::PlusY => wire::Up::PlusY,
+        Up::MinusY => wire::Up::MinusY,
+        Up::PlusZ => wire::Up::PlusZ,
+        Up::MinusZ => wire::Up::MinusZ,
+        Up::Unknown => wire::Up::Unknown,
+        Up::Auto => wire::Up::Auto,
+    }
+}
+
+fn operator_to_wire(operator: Operator) -> wire::Operator {
+    match operator {
+        Operator::Tufted => wire::Operator::Tufted,
+        Operator::Cotan => wire::Operator::Cotan,
+        Operator::MeshLaplace => wire::Operator::MeshLaplace,
+    }
+}
+
+/// What to create; fields that are not given take their defaults.
+pub fn collection_spec(spec: &wire::CollectionSpec, field: &str) -> Result<CollectionSpec, wire::Error> {
+    let range = |name: &str, value: i32| {
+        let field = format!("{field}.{name}");
+        field_error(
+            wire::ErrorReason::FieldRange,
+            &field,
+            format!("{field} is {value}, which this version does not know"),
+        )
+    };
+    let up = match wire::Up::try_from(spec.up).map_err(|_| range("up", spec.up))? {
+        wire::Up::PlusX => Up::PlusX,
+        wire::Up::MinusX => Up::MinusX,
+        wire::Up::PlusY => Up::PlusY,
+        wire::Up::MinusY => Up::MinusY,
+        wire::Up::PlusZ => Up::PlusZ,
+        wire::Up::MinusZ => Up::MinusZ,
+        wire::Up::Unspecified | wire::Up::Unknown => Up::Unknown,
+        wire::Up::Auto => Up::Auto,
+    };
+    let operator =
+        wire::Operator::try_from(spec.operator).map_err(|_| range("operator", spec.operator))?;
+    let operator = match operator {
+        wire::Operator::Unspecified | wire::Operator::Tufted => Operator::Tufted,
+        wire::Operator::Cotan => Operator::Cotan,
+        wire::Operator::MeshLaplace => Operator::MeshLaplace,
+    };
+    Ok(CollectionSpec {
+        name: spec.name.clone(),
+        n_parts: spec.n_parts.filter(|&n| n > 0),
+        up,
+        operator,
+        working_faces: spec.working_faces,
+    })
+}
+
+/// The first setting in which a wish, where it states one, differs from what is: its name, the wish and
+/// what is, for people.
+pub fn collection_differs(
+    wish: &wire::CollectionSpec,
+    is: &CollectionSpec,
+) -> Option<(&'static str, String, String)> {
+    let is = spec_to_wire(is);
+    let parts = |n: u32| if n == 0 { "estimated".to_owned() } else { n.to_string() };
+    if let Some(n) = wish.n_parts.filter(|&n| n != is.n_parts()) {
+        return Some(("n_parts", parts(n), parts(is.n_parts())));
+    }
+    if wish.up() != wire::Up::Unspecified && wish.up() != is.up() {
+        return Some(("up", up_name(wish.up()).to_owned(), up_name(is.up()).to_owned()));
+    }
+    if wish.operator() != wire::Operator::Unspecified && wish.operator() != is.operator() {
+        let name = |o: wire::Operator| operator_name(o).to_owned();
+        return Some(("operator", name(wish.operator()), name(is.operator())));
+    }
+    if wish.working_faces != 0 && wish.working_faces != is.working_faces {
+        let (wish, is) = (wish.working_faces.to_string(), is.working_faces.to_string());
+        return Some(("working_faces", wish, is));
+    }
+    None
+}
+
+/// As people write it: `+y`, `unknown`, `auto`.
+fn up_name(up: wire::Up) -> &'static str {
+    match up {
+        wire::Up::PlusX => "+x",
+        wire::Up::MinusX => "-x",
+        wire::Up::PlusY => "+y",
+        wire::Up::MinusY => "-y",
+        wire::Up::PlusZ => "+z",
+        wire::Up::MinusZ => "-z",
+        wire::Up::Unspecified | wire::Up::Unknown => "unknown",
+        wire::Up::Auto => "auto",
+    }
+}
+
+fn operator_name(operator: wire::Operator) -> &'static str {
+    match operator {
+        wire::Operator::Unspecified | wire::Operator::Tufted => "tufted",
+        wire::Operator::Cotan => "cotan",
+        wire::Operator::MeshLaplace => "mesh-laplace",
+    }
+}
+
+fn spec_to_wire(spec: &CollectionSpec) -> wire::CollectionSpec {
+    wire::CollectionSpec {
+        name: spec.name.clone(),
+        n_parts: Some(spec.n_parts.unwrap_or(0)),
+        up: up_to_wire(spec.up).into(),
+        operator: operator_to_wire(spec.operator).into(),
+        working_faces: spec.working_faces,
+    }
+}
+
+/// A label.
+pub fn label_info(label: &LabelInfo) -> wire::LabelInfo {
+    let [r, g, b] = label.colour.map(u32::from);
+    wire::LabelInfo {
+        id: label.id,
+        name: label.name.clone().unwrap_or_default(),
+        colour_rgb: r << 16 | g << 8 | b,
+        merged_into: label.merged_into,
+    }
+}
+
+/// A collection.
+pub fn collection(info: &CollectionInfo) -> wire::Collection {
+    wire::Collection {
+        spec: Some(spec_to_wire(&info.spec)),
+        sequence: info.sequence,
+        n_shapes: info.n_shapes,
+        n_stale: info.n_stale,
+        labels: info.labels.iter().map(label_info).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{collection_differs, collection_spec, spec_to_wire};
+    use crate::ipc::wire;
+    use crate::library::{CollectionSpec, Up};
+
+    #[test]
+    fn settings_survive_the_way() {
+        let spec = CollectionSpec {
+            name: "chairs".to_owned(),
+            n_parts: Some(3),
+            up: Up::MinusZ,
+            operator: crate::operators::Operator::Cotan,
+            working_faces: 4_000,
+        };
+        assert_eq!(collection_spec(&spec_to_wire(&spec), "spec"), Ok(spec));
+    }
+
+    #[test]
+    fn only_stated_settings_are_compared() {
+        let is = CollectionSpec { n_parts: Some(3), up: Up::PlusY, ..CollectionSpec::default() };
+        let mut wish = wire::CollectionSpec::default();
+        assert_eq!(collection_differs(&wish, &is), None);
+        wish.n_parts = Some(3);
+        wish.set_up(wire::Up::PlusY);
+        assert_eq!(collection_differs(&wish, &is), None);
+        wish.n_parts = Some(0);
+        let expected = ("n_parts", "estimated".to_owned(), "3".to_owned());
+        assert_eq!(collection_differs(&wish, &is), Some(expected));
+        wish.n_parts = None;
+        wish.set_up(wire::Up::Unknown);
+        let expected = ("up", "unknown".to_owned(), "+y".to_owned());
+        assert_eq!(collection_differs(&wish, &is), Some(expected));
+    }
+
+    #[test]
+    fn unknown_enum_values_are_refused() {
+        let spec = wire::CollectionSpec { up: 99, ..wire::CollectionSpec::default() };
+        let error = collection_spec(&spec, "spec").unwrap_err();
+        assert_eq!(error.message, "spec.up is 99, which this version does not know");
+        assert_eq!(error.reason(), wire::ErrorReason::FieldRange);
+    }
+}

@@ -1,0 +1,141 @@
+//! Labels of the proxy become labels of the input mesh, with boundaries that follow its own creases.
+//!
+//! Away from boundaries a face takes the label of its proxy face. In a band around them, about as wide as the
+//! proxy's triangles, a cut at full resolution decides.
+
+use super::cut::cut;
+use crate::segmentation::{Surface, SurfaceEdge};
+
+/// Half width of the band, in mean edge lengths of the proxy.
+const BAND_EDGES: f64 = 1.5;
+/// Boundary strength of the cut, and the least probability that counts.
+const STRENGTH: f64 = 3.0;
+const FLOOR: f64 = 0.02;
+
+/// Classes of the faces `(m,)` of a full-resolution surface, given for each its proxy face, and the proxy's
+/// classes `(p,)` and probabilities `(p, k)`, 0 to 255. `proxy_edge` is the proxy's mean edge length, in the
+/// same units as the surface.
+pub fn refine_boundary(
+    surface: &Surface,
+    proxy_face: &[u32],
+    proxy_edge: f64,
+    classes: &[u32],
+    probabilities: &[u8],
+    k: usize,
+) -> Vec<u32> {
+    let m = surface.n_faces();
+    let mut labels: Vec<u32> = proxy_face.iter().map(|p| classes[*p as usize]).collect();
+    let depth = band(surface, &labels, BAND_EDGES * proxy_edge);
+    // The band, and the faces around it as pinned border conditions.
+    let mut local = vec![u32::MAX; m];
+    let mut members: Vec<u32> = Vec::new();
+    let mut include = |f: u32, members: &mut Vec<u32>| {
+        if local[f as usize] == u32::MAX {
+            local[f as usize] = members.len() as u32;
+            members.push(f);
+        }
+    };
+    for e in &surface.edges {
+        if e.faces.iter().any(|f| depth[*f as usize].is_finite()) {
+            e.faces.iter().for_each(|f| include(*f, &mut members));
+        }
+    }
+    if members.is_empty() {
+        return labels;
+    }
+    let edges = surface
+        .edges
+        .iter()
+        .filter(|e| e.faces.iter().any(|f| depth[*f as usize].is_finite()))
+        .map(|e| SurfaceEdge { faces: e.faces.map(|f| local[f as usize]), ..*e })
+        .collect();
+    let total: f64 = members.iter().map(|f| surface.area[*f as usize]).sum();
+    let sub = Surface {
+        area: members.iter().map(|f| surface.area[*f as usize] / total.max(1e-300)).collect(),
+        centroids: Vec::new(),
+        edges,
+    };
+    let mut unary = Vec::with_capacity(members.len() * k);
+    let mut pinned = Vec::with_capacity(members.len());
+    for &f in &members {
+        let p = proxy_face[f as usize] as usize;
+        unary.extend((0..k).map(|l| -(f64::from(probabilities[p * k + l]) / 255.0).max(FLOOR).ln()));
+        pinned.push((!depth[f as usize].is_finite()).then_some(labels[f as usize]));
+    }
+    let refined = cut(&sub, &unary, k, STRENGTH, Some(&pinned));
+    for (f, l) in members.into_iter().zip(refined) {
+        labels[f as usize] = l;
+    }
+    labels
+}
+
+/// Distance of each face from the nearest label boundary along the dual graph; infinite beyond `width`.
+fn band(surface: &Surface, labels: &[u32], width: f64) -> Vec<f64> {
+    let m = surface.n_faces();
+    let mut neighbours: Vec<Vec<(u32, f64)>> = vec![Vec::new(); m];
+    let mut depth = vec![f64::INFINITY; m];
+    let mut front = Vec::new();
+    for e in &surface.edges {
+        let [a, b] = e.faces;
+        let (p, q) = (surface.centroids[a as usize], surface.centroids[b as usize]);
+        let step = (0..3).map(|c| (p[c] - q[c]).powi(2)).sum::<f64>().sqrt();
+        neighbours[a as usize].push((b, step));
+        neighbours[b as usize].push((a, step));
+        if labels[a as usize] != labels[b as usize] {
+            for f in [a, b] {
+                if depth[f as usize] > 0.0 {
+                    depth[f as usize] = 0.0;
+                    front.push(f);
+                }
+            }
+        }
+    }
+    // Label correcting: the band is a few rings wide, so a queue does without a heap.
+    while !front.is_empty() {
+        let mut next = Vec::new();
+        for f in front {
+            for &(g, step) in &neighbours[f as usize] {
+                let d = depth[f as usize] + step;
+                if d <= width && d < depth[g as usize] {
+                    depth[g as usize] = d;
+                    next.push(g);
+                }
+            }
+        }
+        front = next;
+    }
+    depth
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A strip of `n` faces with a concave crease between faces `crease` and `crease + 1`.
+    fn strip(n: u32, crease: u32) -> Surface {
+        let edge = |a: u32| SurfaceEdge {
+            faces: [a, a + 1],
+            length: 1.0,
+            crease: if a == crease { 0.9 } else { 0.0 },
+            boundary_cost: if a == crease { 0.02 } else { 1.0 },
+        };
+        Surface {
+            area: vec![1.0 / f64::from(n); n as usize],
+            centroids: (0..n).map(|f| [f64::from(f), 0.0, 0.0]).collect(),
+            edges: (0..n - 1).map(edge).collect(),
+        }
+    }
+
+    #[test]
+    fn the_boundary_moves_to_the_crease_within_the_band() {
+        let surface = strip(40, 17);
+        let proxy_face: Vec<u32> = (0..40).map(|f| f / 5).collect();
+        let classes: Vec<u32> = (0..8).map(|p| u32::from(p >= 4)).collect();
+        let probabilities: Vec<u8> =
+            classes.iter().flat_map(|c| if *c == 0 { [150, 105] } else { [105, 150] }).collect();
+        let refined = refine_boundary(&surface, &proxy_face, 3.0, &classes, &probabilities, 2);
+        assert_eq!(refined.iter().position(|l| *l == 1), Some(18));
+        let far = refine_boundary(&surface, &proxy_face, 0.5, &classes, &probabilities, 2);
+        assert_eq!(far.iter().position(|l| *l == 1), Some(20), "the crease is outside the band");
+    }
+}

@@ -1,0 +1,141 @@
+//! How good a labelling of patches is, without any ground truth.
+//!
+//! Good labels have boundaries along concave creases and join what is alike or touches:
+//! `½ ln(concavity) + ln(association)`. Concavity is the length-weighted mean crease on label boundaries over
+//! that on all patch boundaries; association the mean over labels of the affinity within the label over all
+//! its affinity, in the joint patch graph.
+
+use super::joint::{Rows, combine, inter_shape, symmetric};
+use crate::segmentation::PatchGraph;
+use sprs::CsMat;
+
+const CONCAVITY_WEIGHT: f64 = 0.5;
+/// Share of the intra-shape graph in the joint patch graph.
+const ALPHA: f64 = 0.5;
+/// Crease at which the affinity of touching patches has fallen to 1/e.
+pub(super) const CREASE_SCALE: f64 = 0.1;
+
+/// The patches of all shapes, numbered through, with their boundaries and affinities.
+pub(super) struct Criterion {
+    boundaries: Vec<(u32, u32, f64, f64)>,
+    mean_crease: f64,
+    affinity: CsMat<f64>,
+}
+
+/// Sums over pairs of labels `(k, k)`: boundary length, creased length, affinity.
+#[derive(Clone)]
+pub(super) struct PairSums {
+    k: usize,
+    length: Vec<f64>,
+    creased: Vec<f64>,
+    affinity: Vec<f64>,
+}
+
+impl Criterion {
+    /// The criterion on the patches of some shapes, whose mean descriptors are `means (n_patches, dim)`.
+    pub(super) fn new(patches: &[&PatchGraph], means: &[f64], dim: usize, offsets: &[usize]) -> Self {
+        let mut boundaries = Vec::new();
+        let mut intra = Vec::new();
+        for (graph, &offset) in patches.iter().zip(offsets) {
+            let total: f64 = graph.edges.iter().map(|e| e.1).sum();
+            let mean_length = total / graph.edges.len().max(1) as f64;
+            for &([a, b], length, crease) in &graph.edges {
+                let (i, j) = (offset + a as usize, offset + b as usize);
+                boundaries.push((i as u32, j as u32, length, length * crease));
+                intra.push((i, j, length / mean_length.max(1e-300) * (-crease / CREASE_SCALE).exp()));
+            }
+        }
+        let n = *offsets.last().unwrap_or(&0);
+        let intra = symmetric(n, intra.into_iter());
+        let inter = inter_shape(&Rows { values: means, dim, offsets });
+        let length: f64 = boundaries.iter().map(|b| b.2).sum();
+        let creased: f64 = boundaries.iter().map(|b| b.3).sum();
+        Self {
+            boundaries,
+            mean_crease: creased / length.max(1e-300),
+            affinity: combine(&inter, &intra, ALPHA),
+        }
+    }
+
+    /// Pair sums of a labelling of all patches with labels below `k`.
+    pub(super) fn pair_sums(&self, labels: &[u32], k: usize) -> PairSums {
+        let mut sums =
+            PairSums { k, length: vec![0.0; k * k], creased: vec![0.0; k * k], affinity: vec![0.0; k * k] };
+        for &(i, j, length, creased) in &self.boundaries {
+            let (a, b) = (labels[i as usize] as usize, labels[j as usize] as usize);
+            for at in [a * k + b, b * k + a] {
+                sums.length[at] += length;
+                sums.creased[at] += creased;
+            }
+        }
+        for (i, row) in self.affinity.outer_iterator().enumerate() {
+            for (j, w) in row.iter() {
+                sums.affinity[labels[i] as usize * k + labels[j] as usize] += w;
+            }
+        }
+        sums
+    }
+
+    /// The score of a labelling, from its pair sums; higher is better.
+    pub(super) fn score(&self, sums: &PairSums) -> f64 {
+        let (concavity, association, _) = self.terms(sums);
+        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + association.max(1e-6).ln()
+    }
+
+    /// A score that labellings with different numbers of labels can be compared by: the association above
+    /// what chance would give (Newman and Girvan's modularity) in the place of the plain one.
+    pub(super) fn score_over_k(&self, sums: &PairSums) -> f64 {
+        let (concavity, _, modularity) = self.terms(sums);
+        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
+    }
+
+    fn terms(&self, sums: &PairSums) -> (f64, f64, f64) {
+        let k = sums.k;
+        let off_diagonal = |m: &[f64]| -> f64 {
+            m.iter().sum::<f64>() - (0..k).map(|l| m[l * k + l]).sum::<f64>()
+        };
+        let concavity =
+            off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9) / self.mean_crease.max(1e-300);
+        let volume = |l: usize| sums.affinity[l * k..(l + 1) * k].iter().sum::<f64>();
+        let total: f64 = (0..k).map(volume).sum();
+        let within = |l: usize| sums.affinity[l * k + l];
+        let association = (0..k).map(|l| within(l) / volume(l).max(1e-9)).sum::<f64>() / k as f64;
+        let modularity = (0..k)
+            .map(|l| within(l) / total.max(1e-300) - (volume(l) / total.max(1e-300)).powi(2))
+            .sum::<f64>();
+        (concavity, association, modularity)
+    }
+}
+
+impl PairSums {
+    /// The sums after label `b` is merged into `a`, and labels above `b` move down by one.
+    pub(super) fn merged(&self, a: usize, b: usize) -> Self {
+        let k = self.k - 1;
+        let place = |l: usize| match l.cmp(&b) {
+            std::cmp::Ordering::Less => l,
+            std::cmp::Ordering::Equal => {
+                if a > b {
+                    a - 1
+                } else {
+                    a
+                }
+            }
+            std::cmp::Ordering::Greater => l - 1,
+        };
+        let shrink = |m: &[f64]| {
+            let mut out = vec![0.0; k * k];
+            for i in 0..self.k {
+                for j in 0..self.k {
+                    out[place(i) * k + place(j)] += m[i * self.k + j];
+                }
+            }
+            out
+        };
+        Self {
+            k,
+            length: shrink(&self.length),
+            creased: shrink(&self.creased),
+            affinity: shrink(&self.affinity),
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! Face descriptors become comparable across a collection: standardised, clipped, weighted by group.
+
+use crate::descriptors;
+use crate::pipeline::DescriptionView;
+
+/// Standardised values are clipped to this many standard deviations.
+const CLIP: f64 = 4.0;
+
+/// Face descriptors of one shape, row-major `(m, dim)`; with a known up axis three columns more.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Features {
+    /// The values.
+    pub data: Vec<f32>,
+    /// Columns.
+    pub dim: usize,
+}
+
+/// Names and widths of the descriptor groups, in column order.
+pub(crate) fn groups(up_known: bool) -> Vec<(&'static str, usize)> {
+    let mut groups = descriptors::GROUPS.to_vec();
+    if up_known {
+        groups.push(("up", 3));
+    }
+    groups
+}
+
+impl Features {
+    /// The descriptors of a shape as they are; `up` is the collection's up axis, if it is known.
+    pub fn raw(shape: &DescriptionView<'_>, up: Option<[f64; 3]>) -> Self {
+        let n = shape.n_descriptors;
+        let Some(axis) = up else {
+            return Self { data: shape.face_descriptors.to_vec(), dim: n };
+        };
+        let columns = descriptors::up_columns(&shape.mesh(), axis);
+        let mut data = Vec::with_capacity(shape.faces.len() * (n + 3));
+        for (row, extra) in shape.face_descriptors.chunks_exact(n).zip(&columns) {
+            data.extend_from_slice(row);
+            data.extend_from_slice(extra);
+        }
+        Self { data, dim: n + 3 }
+    }
+
+    /// Values at vertices `(n, dim)`: area-weighted means over the faces around each.
+    pub fn at_vertices(&self, n_vertices: usize, faces: &[[u32; 3]], area: &[f64]) -> Vec<f32> {
+        let mut sum = vec![0.0f64; n_vertices * self.dim];
+        let mut weight = vec![0.0f64; n_vertices];
+        for (f, face) in faces.iter().enumerate() {
+            for &v in face {
+                let v = v as usize;
+                weight[v] += area[f];
+                let row = &self.data[f * self.dim..(f + 1) * self.dim];
+                for (s, &x) in sum[v * self.dim..(v + 1) * self.dim].iter_mut().zip(row) {
+                    *s += area[f] * f64::from(x);
+                }
+            }
+        }
+        sum.chunks_exact(self.dim)
+            .zip(&weight)
+            .flat_map(|(row, w)| row.iter().map(move |s| (s / w.max(1e-300)) as f32))
+            .collect()
+    }
+}
+
+/// What standardises the descriptors of a collection.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Normalisation {
+    /// Area-weighted mean of each column.
+    pub mean: Vec<f64>,
+    /// Area-weighted standard deviation of each column.
+    pub deviation: Vec<f64>,
+    /// Whether the columns of the up axis are among them.
+    pub up_known: bool,
+}
+
+impl Normalisation {
+    /// Mean and deviation over shapes of equal weight; each comes as raw features and area shares.
+    pub fn fit<'a>(shapes: impl Iterator<Item = (&'a Features, &'a [f64])>, up_known: bool) -> Self {
+        let (mut n, mut mean, mut square) = (0.0, Vec::new(), Vec::new());
+        for (features, area) in shapes {
+            mean.resize(features.dim, 0.0);
+            square.resize(features.dim, 0.0);
+            n += 1.0;
+            for (row, a) in features.data.chunks_exact(features.dim).zip(area) {
+                for (c, &x) in row.iter().enumerate() {
+                    mean[c] += a * f64::from(x);
+                    square[c] += a * f64::from(x) * f64::from(x);
+                }
+            }
+        }
+        let n = f64::max(n, 1.0);
+        mean.iter_mut().for_each(|m| *m /= n);
+        let deviation =
+            square.iter().zip(&mean).map(|(s, m)| (s / n - m * m).max(0.0).sqrt() + 1e-9).collect();
+        Self { mean, deviation, up_known }
+    }
+
+    /// `clip((x − mean) / deviation, ±4) / √(width of the column's group)`.
+    pub fn standardise(&self, raw: &Features) -> Features {
+        let dim = self.mean.len();
+        assert_eq!(raw.dim, dim, "features and normalisation have the same columns");
+        let mut scale = Vec::with_capacity(dim);
+        for (_, width) in groups(self.up_known) {
+            scale.extend(std::iter::repeat_n(1.0 / (width as f64).sqrt(), width));
+        }
+        let standard = |(i, &x): (usize, &f32)| {
+            let c = i % dim;
+            let z = (f64::from(x) - self.mean[c]) / self.deviation[c];
+            (z.clamp(-CLIP, CLIP) * scale[c]) as f32
+        };
+        Features { data: raw.data.iter().enumerate().map(standard).collect(), dim }
+    }
+}

@@ -1,0 +1,170 @@
+//! What a collection has learnt of its labels: linear discriminant analysis on face descriptors, kept as
+//! sufficient statistics, so that a shape is added or taken away exactly.
+
+use super::{Features, Normalisation};
+use nalgebra::{Cholesky, DMatrix};
+
+/// Share of the mean variance mixed into the pooled covariance.
+const SHRINKAGE: f64 = 0.02;
+
+/// Counts, sums and second moments of labelled faces, each weighted by its share of its shape's area.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Statistics {
+    /// Area of each label `(k,)`.
+    pub counts: Vec<f64>,
+    /// Sum of descriptors of each label `(k, dim)`.
+    pub sums: Vec<f64>,
+    /// Sum of outer products over all labels `(dim, dim)`, symmetric.
+    pub moment: Vec<f64>,
+}
+
+impl Statistics {
+    /// Statistics of nothing.
+    pub fn empty(k: usize, dim: usize) -> Self {
+        Self { counts: vec![0.0; k], sums: vec![0.0; k * dim], moment: vec![0.0; dim * dim] }
+    }
+
+    /// Statistics of one labelled shape; faces whose label is `None` do not count.
+    pub fn of_shape(features: &Features, area: &[f64], labels: impl Fn(usize) -> Option<u32>, k: usize) -> Self {
+        let dim = features.dim;
+        let mut s = Self::empty(k, dim);
+        let mut weighted = DMatrix::<f64>::zeros(dim, area.len());
+        for (f, row) in features.data.chunks_exact(dim).enumerate() {
+            let Some(label) = labels(f).map(|l| l as usize) else { continue };
+            s.counts[label] += area[f];
+            let root = area[f].sqrt();
+            for (c, &x) in row.iter().enumerate() {
+                s.sums[label * dim + c] += area[f] * f64::from(x);
+                weighted[(c, f)] = root * f64::from(x);
+            }
+        }
+        let moment = &weighted * weighted.transpose();
+        s.moment.copy_from_slice(moment.as_slice());
+        s
+    }
+
+    /// Adds `sign` times `other`.
+    pub fn accumulate(&mut self, other: &Self, sign: f64) {
+        let pairs = [
+            (&mut self.counts, &other.counts),
+            (&mut self.sums, &other.sums),
+            (&mut self.moment, &other.moment),
+        ];
+        for (mine, theirs) in pairs {
+            mine.iter_mut().zip(theirs).for_each(|(a, b)| *a += sign * b);
+        }
+    }
+
+    /// The linear classifier these statistics make: pooled covariance with shrinkage, priors by area.
+    pub fn classifier(&self) -> Classifier {
+        let k = self.counts.len();
+        let dim = self.sums.len() / k.max(1);
+        let total: f64 = self.counts.iter().sum();
+        let mean = DMatrix::from_fn(k, dim, |l, c| self.sums[l * dim + c] / self.counts[l].max(1e-12));
+        let mut within = DMatrix::from_column_slice(dim, dim, &self.moment);
+        let scaled = DMatrix::from_fn(k, dim, |l, c| mean[(l, c)] * self.counts[l]);
+        within -= scaled.transpose() * &mean;
+        within /= total.max(1e-300);
+        let ridge = SHRINKAGE * within.trace() / dim as f64;
+        within *= 1.0 - SHRINKAGE;
+        for c in 0..dim {
+            within[(c, c)] += ridge.max(1e-9);
+        }
+        // Shrinkage keeps it positive definite but for statistics of nothing, where weights are zero.
+        let weights = Cholesky::new(within)
+            .map_or_else(|| DMatrix::zeros(dim, k), |factor| factor.solve(&mean.transpose()));
+        let bias = (0..k)
+            .map(|l| {
+                let half: f64 = (0..dim).map(|c| weights[(c, l)] * mean[(l, c)]).sum::<f64>() / 2.0;
+                (self.counts[l] / total.max(1e-300)).max(1e-9).ln() - half
+            })
+            .collect();
+        Classifier { weights: weights.as_slice().to_vec(), bias, dim }
+    }
+}
+
+/// A linear classifier of faces.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Classifier {
+    weights: Vec<f64>,
+    bias: Vec<f64>,
+    dim: usize,
+}
+
+impl Classifier {
+    /// Log-probability of each label for each face `(m, k)`, row-major.
+    pub fn log_probabilities(&self, features: &Features) -> Vec<f64> {
+        let k = self.bias.len();
+        let mut out = Vec::with_capacity(features.data.len() / self.dim * k);
+        for row in features.data.chunks_exact(self.dim) {
+            let start = out.len();
+            for (l, b) in self.bias.iter().enumerate() {
+                let w = &self.weights[l * self.dim..(l + 1) * self.dim];
+                out.push(b + w.iter().zip(row).map(|(w, x)| w * f64::from(*x)).sum::<f64>());
+            }
+            let scores = &mut out[start..];
+            let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let log_sum = scores.iter().map(|s| (s - top).exp()).sum::<f64>().ln() + top;
+            scores.iter_mut().for_each(|s| *s -= log_sum);
+        }
+        out
+    }
+}
+
+/// The label model of a collection.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelModel {
+    /// Counts the re-clusterings that were taken into the model; statistics of another epoch do not mix.
+    pub epoch: u64,
+    /// Label id of each class `(k,)`.
+    pub labels: Vec<u32>,
+    /// What standardises descriptors in this epoch.
+    pub normalisation: Normalisation,
+    /// Sum over the shapes that inform the model.
+    pub statistics: Statistics,
+    /// Unit vector of the up axis in input coordinates, if it is known.
+    pub up: Option<[f64; 3]>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+
+    fn blobs(seed: u64) -> (Features, Vec<f64>, Vec<u32>) {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(seed);
+        let labels: Vec<u32> = (0..600).map(|i| i % 3).collect();
+        let data = labels
+            .iter()
+            .flat_map(|l| {
+                let noise: [f32; 2] = [rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0)];
+                [*l as f32 * 3.0 + noise[0], noise[1] - *l as f32]
+            })
+            .collect();
+        (Features { data, dim: 2 }, vec![1.0 / 600.0; 600], labels)
+    }
+
+    #[test]
+    fn separable_labels_are_learnt() {
+        let (x, a, y) = blobs(1);
+        let classifier = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3).classifier();
+        let p = classifier.log_probabilities(&x);
+        let right = p.chunks(3).zip(&y).filter(|(p, y)| (0..3).all(|l| p[l] <= p[**y as usize])).count();
+        assert!(right > 590, "{right} of 600");
+        assert!(p.chunks(3).all(|p| (p.iter().map(|v| v.exp()).sum::<f64>() - 1.0).abs() < 1e-9));
+    }
+
+    #[test]
+    fn taking_a_shape_away_undoes_adding_it() {
+        let (x, a, y) = blobs(1);
+        let (x2, a2, y2) = blobs(2);
+        let one = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3);
+        let mut both = one.clone();
+        let other = Statistics::of_shape(&x2, &a2, |f| (f % 2 == 0).then_some(y2[f]), 3);
+        both.accumulate(&other, 1.0);
+        both.accumulate(&other, -1.0);
+        let same = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(same(&both.counts, &one.counts) && same(&both.sums, &one.sums));
+        assert!(same(&both.moment, &one.moment));
+    }
+}

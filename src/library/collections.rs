@@ -1,0 +1,172 @@
+//! Collections: created, described, deleted; their labels named.
+
+use super::commit::event;
+use super::rows::{damaged, operator_from_name, operator_name, to_json};
+use super::{
+    CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
+    RequestKey, Result, Up,
+};
+use crate::pipeline::Params;
+use crate::store::{CollectionRow, Digest, NewCollection, Reader};
+
+const MAX_NAME: usize = 128;
+const MAX_LABEL_NAME: usize = 128;
+/// Most part kinds a collection can be given.
+const MAX_PARTS: u32 = 64;
+const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
+
+impl Library {
+    /// Creates a collection. The same key gives the same collection again.
+    ///
+    /// # Errors
+    /// A name or number out of range, or a name that is taken.
+    pub fn create_collection(
+        &self,
+        spec: &CollectionSpec,
+        key: Option<&RequestKey>,
+    ) -> Result<CollectionInfo> {
+        check_name("collection", &spec.name, MAX_NAME)?;
+        if let Some(n) = spec.n_parts.filter(|n| !(1..=MAX_PARTS).contains(n)) {
+            let message = format!("the number of parts is {n}, but must be 1 to {MAX_PARTS}");
+            return Err(LibraryError::invalid("N_PARTS_RANGE", message));
+        }
+        let working_faces = match spec.working_faces {
+            0 => Params::default().working_faces,
+            n if WORKING_FACES.contains(&n) => n,
+            n => {
+                let (least, most) = (WORKING_FACES.start(), WORKING_FACES.end());
+                let message = format!("working_faces is {n}, but must be {least} to {most}");
+                return Err(LibraryError::invalid("WORKING_FACES_RANGE", message));
+            }
+        };
+        let request = Digest::of(to_json(&format!("create {spec:?}")).as_bytes());
+        self.once(key, request, |tx| {
+            if tx.collection(&spec.name)?.is_some() {
+                return Err(LibraryError::AlreadyExists {
+                    reason: "COLLECTION_EXISTS",
+                    message: format!("a collection named {:?} is there already", spec.name),
+                });
+            }
+            let id = tx.insert_collection(&NewCollection {
+                name: spec.name.clone(),
+                n_parts: spec.n_parts,
+                up: spec.up.to_string(),
+                operator: operator_name(spec.operator).into(),
+                working_faces,
+                state: Vec::new(),
+            })?;
+            event(tx, id, &EventKind::CollectionCreated)?;
+            Ok(Vec::new())
+        })?;
+        self.collection(&spec.name)
+    }
+
+    /// All collections by name.
+    ///
+    /// # Errors
+    /// The catalog cannot be read.
+    pub fn collections(&self) -> Result<Vec<CollectionInfo>> {
+        self.store.catalog().read(|r| r.collections()?.into_iter().map(|c| info(r, c)).collect())
+    }
+
+    /// One collection.
+    ///
+    /// # Errors
+    /// There is none of the name.
+    pub fn collection(&self, name: &str) -> Result<CollectionInfo> {
+        let row = self.collection_row(name)?;
+        self.store.catalog().read(|r| info(r, row))
+    }
+
+    /// Deletes a collection with all its shapes.
+    ///
+    /// # Errors
+    /// There is none of the name.
+    pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
+        let request = Digest::of(format!("delete {name:?}").as_bytes());
+        self.once(key, request, |tx| {
+            let row = tx.collection(name)?;
+            let row =
+                row.ok_or_else(|| LibraryError::NotFound { what: "collection", name: name.into() })?;
+            event(tx, row.id, &EventKind::CollectionDeleted)?;
+            tx.delete_collection(row.id)?;
+            Ok(Vec::new())
+        })?;
+        Ok(())
+    }
+
+    /// Gives a label a name.
+    ///
+    /// # Errors
+    /// There is no such collection or label, or the name is out of range.
+    pub fn name_label(
+        &self,
+        collection: &str,
+        label: LabelId,
+        name: &str,
+        key: Option<&RequestKey>,
+    ) -> Result<LabelInfo> {
+        check_name("label", name, MAX_LABEL_NAME)?;
+        let row = self.collection_row(collection)?;
+        let request = Digest::of(format!("name {collection:?} {label} {name:?}").as_bytes());
+        self.with_lane(row, |lane| {
+            self.once(key, request, |tx| {
+                let mut known = find_label(tx, lane.row.id, label)?;
+                known.name = Some(name.to_string());
+                tx.put_label(lane.row.id, &known)?;
+                event(tx, lane.row.id, &EventKind::LabelNamed { label, name: name.into() })?;
+                Ok(Vec::new())
+            })
+        })?;
+        let row = self.collection_row(collection)?;
+        self.store.catalog().read(|r| find_label(r, row.id, label).map(label_info))
+    }
+}
+
+fn find_label(
+    reader: &Reader<'_>,
+    collection: crate::store::CollectionId,
+    label: LabelId,
+) -> Result<crate::store::LabelRow> {
+    let found = reader.labels(collection)?.into_iter().find(|l| l.id == label);
+    found.ok_or_else(|| LibraryError::NotFound { what: "label", name: label.to_string() })
+}
+
+fn label_info(row: crate::store::LabelRow) -> LabelInfo {
+    LabelInfo { id: row.id, name: row.name, colour: row.colour, merged_into: row.merged_into }
+}
+
+fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
+    let place = format!("collections {}", row.name);
+    Ok(CollectionInfo {
+        sequence: row.sequence,
+        n_shapes: reader.n_shapes(row.id)?,
+        n_stale: reader.n_stale(row.id)?,
+        labels: reader.labels(row.id)?.into_iter().map(label_info).collect(),
+        spec: CollectionSpec {
+            n_parts: row.n_parts,
+            up: row.up.parse::<Up>().map_err(|e| damaged(&place, &e))?,
+            operator: operator_from_name(&row.operator, &place)?,
+            working_faces: row.working_faces,
+            name: row.name,
+        },
+    })
+}
+
+/// A name that people, file systems and logs can live with.
+pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
+    let n = name.chars().count();
+    if n == 0 || n > limit {
+        let message = format!("the {what} name has {n} characters, but must have 1 to {limit}");
+        return Err(LibraryError::invalid("BAD_NAME", message));
+    }
+    if let Some(c) = name.chars().find(|c| *c == '/' || c.is_control()) {
+        let message =
+            format!("the {what} name {name:?} has {c:?}, but / and control characters are not allowed");
+        return Err(LibraryError::invalid("BAD_NAME", message));
+    }
+    if name == "." || name == ".." {
+        return Err(LibraryError::invalid("BAD_NAME", format!("the {what} name is {name:?}")));
+    }
+    Ok(())
+}

@@ -1,0 +1,82 @@
+//! The serial state of one collection while shapes are placed into it.
+
+use super::learnt::Learnt;
+use super::rows::{CollectionState, damaged, from_json};
+use super::{Result, Up};
+use crate::neighbors::SignatureMetric;
+use crate::store::{CollectionRow, Reader, ShapeId};
+
+/// A stored shape, as far as placing others needs it without opening its file.
+#[derive(Debug, Clone)]
+pub(super) struct KnownShape {
+    pub(super) id: ShapeId,
+    pub(super) ordinal: u64,
+    pub(super) stale: bool,
+    pub(super) signature: Vec<f32>,
+}
+
+/// One collection, read from the catalog when it is first needed and kept in step with every commit.
+#[derive(Debug)]
+pub(super) struct Lane {
+    pub(super) row: CollectionRow,
+    pub(super) state: CollectionState,
+    pub(super) learnt: Option<Learnt>,
+    /// By ordinal.
+    pub(super) shapes: Vec<KnownShape>,
+}
+
+impl Lane {
+    /// The lane of a collection, as the catalog has it.
+    pub(super) fn load(reader: &Reader<'_>, row: CollectionRow) -> Result<Self> {
+        let place = format!("collections {}", row.name);
+        let state = if row.state.is_empty() {
+            CollectionState::default()
+        } else {
+            let text = std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
+            from_json(text, &place)?
+        };
+        let learnt = match reader.model(row.id)? {
+            Some(bytes) => Some(Learnt::decode(&bytes).map_err(|e| damaged(&place, &e))?),
+            None => None,
+        };
+        let mut signatures = std::collections::HashMap::new();
+        reader.each_signature(row.id, |id, signature| {
+            signatures.insert(id, signature.to_vec());
+        })?;
+        let mut shapes = Vec::new();
+        for s in reader.shapes(row.id, 0, usize::MAX, None)? {
+            let signature = signatures.remove(&s.id);
+            let signature = signature.ok_or_else(|| damaged(&place, &format!("{} has no signature", s.name)))?;
+            shapes.push(KnownShape { id: s.id, ordinal: s.ordinal, stale: s.stale, signature });
+        }
+        Ok(Self { row, state, learnt, shapes })
+    }
+
+    /// The up axis, where the collection was given one.
+    pub(super) fn up(&self) -> Option<[f64; 3]> {
+        self.row.up.parse::<Up>().ok().and_then(Up::axis)
+    }
+
+    /// Whether a shape's labels are part of the model of this epoch.
+    pub(super) fn informs(&self, shape: &KnownShape) -> bool {
+        shape.ordinal > self.state.epoch_ordinal || self.state.representatives.contains(&shape.ordinal)
+    }
+
+    /// Indices of the shapes nearest to a signature, nearest first.
+    pub(super) fn nearest(&self, signature: &[f32], n_descriptors: usize, limit: usize) -> Vec<(usize, f64)> {
+        let Some(learnt) = &self.learnt else {
+            return Vec::new();
+        };
+        let metric = SignatureMetric::new(&learnt.model.normalisation, n_descriptors);
+        metric.nearest(signature, self.shapes.iter().map(|s| s.signature.as_slice()), limit)
+    }
+
+    /// Shapes to be clustered together, at most `limit`, spread evenly over the order of arrival.
+    pub(super) fn representatives(&self, limit: usize) -> Vec<usize> {
+        let n = self.shapes.len();
+        if n <= limit {
+            return (0..n).collect();
+        }
+        (0..limit).map(|i| i * n / limit).collect()
+    }
+}

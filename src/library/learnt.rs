@@ -1,0 +1,141 @@
+//! What a collection has learnt becomes bytes and back: one safetensors buffer, kept in the catalog.
+
+use crate::labels::{LabelModel, Normalisation, Statistics};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
+use std::collections::HashMap;
+
+/// The label model as it grows, and as it was when its epoch began.
+///
+/// New shapes are labelled by `model`; stored shapes that an accepted re-clustering made stale by `base`, so that
+/// the result does not depend on when that is done.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Learnt {
+    pub(super) model: LabelModel,
+    pub(super) base: Statistics,
+}
+
+impl Learnt {
+    /// At the beginning of an epoch.
+    pub(super) fn begin(model: LabelModel) -> Self {
+        Self { base: model.statistics.clone(), model }
+    }
+
+    /// The model as it was when the epoch began.
+    pub(super) fn base_model(&self) -> LabelModel {
+        LabelModel { statistics: self.base.clone(), ..self.model.clone() }
+    }
+
+    /// The bytes.
+    pub(super) fn encode(&self) -> Vec<u8> {
+        let m = &self.model;
+        let dim = m.normalisation.mean.len();
+        let k = m.labels.len();
+        let labels: Vec<f64> = m.labels.iter().map(|l| f64::from(*l)).collect();
+        let up = m.up.map_or(Vec::new(), |u| u.to_vec());
+        let triangles = [triangle(&m.statistics.moment, dim), triangle(&self.base.moment, dim)];
+        let arrays: [(&str, Vec<usize>, &[f64]); 10] = [
+            ("labels", vec![k], &labels),
+            ("mean", vec![dim], &m.normalisation.mean),
+            ("deviation", vec![dim], &m.normalisation.deviation),
+            ("up", vec![up.len()], &up),
+            ("counts", vec![k], &m.statistics.counts),
+            ("sums", vec![k, dim], &m.statistics.sums),
+            ("moment", vec![triangles[0].len()], &triangles[0]),
+            ("base_counts", vec![k], &self.base.counts),
+            ("base_sums", vec![k, dim], &self.base.sums),
+            ("base_moment", vec![triangles[1].len()], &triangles[1]),
+        ];
+        let bytes: Vec<Vec<u8>> =
+            arrays.iter().map(|a| a.2.iter().flat_map(|x| x.to_le_bytes()).collect()).collect();
+        let views = arrays.iter().zip(&bytes).map(|((name, shape, _), bytes)| {
+            let view = TensorView::new(Dtype::F64, shape.clone(), bytes);
+            (*name, view.expect("invariant: eight bytes a value"))
+        });
+        let epoch = HashMap::from([("epoch".to_string(), m.epoch.to_string())]);
+        serialize(views, Some(epoch)).expect("invariant: names are unique and metadata is text")
+    }
+
+    /// The value that [`Learnt::encode`] wrote; an error says what is wrong with the bytes.
+    pub(super) fn decode(bytes: &[u8]) -> Result<Self, String> {
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| e.to_string())?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+        let epoch = header.metadata().as_ref().and_then(|m| m.get("epoch")).and_then(|e| e.parse().ok());
+        let epoch = epoch.ok_or("label model without an epoch")?;
+        let values = |name: &str| -> Result<Vec<f64>, String> {
+            let t = tensors.tensor(name).map_err(|e| e.to_string())?;
+            let (chunks, rest) = t.data().as_chunks::<8>();
+            if t.dtype() != Dtype::F64 || !rest.is_empty() {
+                return Err(format!("label model: {name} is {:?}, not f64", t.dtype()));
+            }
+            Ok(chunks.iter().map(|c| f64::from_le_bytes(*c)).collect())
+        };
+        let (mean, deviation, labels) = (values("mean")?, values("deviation")?, values("labels")?);
+        let (dim, k) = (mean.len(), labels.len());
+        let statistics = |prefix: &str| -> Result<Statistics, String> {
+            let [counts, sums, moment] = ["counts", "sums", "moment"].map(|n| values(&format!("{prefix}{n}")));
+            let (counts, sums, moment) = (counts?, sums?, moment?);
+            if counts.len() != k || sums.len() != k * dim || moment.len() != dim * (dim + 1) / 2 {
+                return Err(format!("label model: statistics do not fit {k} labels of {dim} columns"));
+            }
+            Ok(Statistics { counts, sums, moment: square(&moment, dim) })
+        };
+        if deviation.len() != dim {
+            return Err(format!("label model: {} deviations for {dim} columns", deviation.len()));
+        }
+        let up = <[f64; 3]>::try_from(values("up")?).ok();
+        let normalisation = Normalisation { mean, deviation, up_known: up.is_some() };
+        let labels = labels.into_iter().map(|l| l as u32).collect();
+        let model = LabelModel { epoch, labels, normalisation, statistics: statistics("")?, up };
+        Ok(Self { model, base: statistics("base_")? })
+    }
+}
+
+/// The lower triangle, row by row.
+fn triangle(square: &[f64], dim: usize) -> Vec<f64> {
+    (0..dim).flat_map(|i| square[i * dim..=i * dim + i].iter().copied()).collect()
+}
+
+fn square(triangle: &[f64], dim: usize) -> Vec<f64> {
+    let mut out = vec![0.0; dim * dim];
+    let mut values = triangle.iter();
+    for i in 0..dim {
+        for (j, v) in (0..=i).zip(&mut values) {
+            out[i * dim + j] = *v;
+            out[j * dim + i] = *v;
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Learnt {
+        let dim = 4;
+        let statistics = Statistics {
+            counts: vec![0.25, 0.75],
+            sums: (0..8).map(f64::from).collect(),
+            moment: (0..16).map(|i| f64::from((i / 4) * (i % 4))).collect(),
+        };
+        let normalisation =
+            Normalisation { mean: vec![0.5; dim], deviation: vec![2.0; dim], up_known: true };
+        let up = Some([0.0, 1.0, 0.0]);
+        let model = LabelModel { epoch: 7, labels: vec![3, 1], normalisation, statistics, up };
+        Learnt::begin(model)
+    }
+
+    #[test]
+    fn reads_back_what_was_written() {
+        let learnt = sample();
+        assert_eq!(Learnt::decode(&learnt.encode()), Ok(learnt));
+    }
+
+    #[test]
+    fn damage_is_an_error() {
+        let bytes = sample().encode();
+        for n in 0..bytes.len() {
+            assert!(Learnt::decode(&bytes[..n]).is_err(), "cut to {n} bytes");
+        }
+    }
+}

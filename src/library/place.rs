@@ -1,0 +1,292 @@
+//! A described shape is placed: related to a few known shapes, labelled, and committed.
+
+use super::commit::Commit;
+use super::lane::{KnownShape, Lane};
+use super::learnt::Learnt;
+use super::rows::{CollectionState, damaged};
+use super::{Described, Library, Outcome, Placed, Result, Source};
+use crate::fmap::{FunctionalMap, MapOptions};
+use crate::labels::DiscoveryOptions;
+use crate::pipeline::{
+    DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote, label, map,
+    recluster,
+};
+use crate::store::{JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId, ShapeRow};
+use std::time::Instant;
+
+/// Most functional maps one addition computes.
+pub const MAX_MAPS: usize = 5;
+/// Most stored shapes that are clustered together, and so relabelled, by one addition; those that stale sources
+/// of the new shape add to it are at most [`MAX_MAPS`].
+pub const MAX_REPRESENTATIVES: usize = 40;
+/// Shapes below which a collection is too small to judge a labelling: the new one is always taken.
+const TOO_FEW: usize = 5;
+/// Growth of a collection from one re-clustering to the next.
+const RECLUSTER_GROWTH: f64 = 1.4;
+
+/// A stored shape that is used as a source: its arrays and its newest labels.
+pub(super) struct Known {
+    pub(super) row: ShapeRow,
+    pub(super) mapped: MappedDescription,
+    pub(super) labels: LabelVersionRow,
+}
+
+/// What an addition changes, before anything is written.
+pub(super) struct Plan {
+    pub(super) learnt: Learnt,
+    pub(super) state: CollectionState,
+    /// Labelling of the new shape, by the classes of `learnt`.
+    pub(super) labelling: Labelling,
+    /// Stored shapes with a new labelling.
+    pub(super) relabelled: Vec<(Known, Labelling)>,
+    pub(super) changes: Vec<LabelChange>,
+    /// Scores before and after, and whether the new labels were taken.
+    pub(super) reclustered: Option<(f64, f64, bool)>,
+}
+
+impl Library {
+    /// Labels a described shape and commits it. `replaced` is taken out in the same commit.
+    pub(super) fn place_described(
+        &self,
+        lane: &mut Lane,
+        accepted: &JobItemRow,
+        described: Described,
+        replaced: Option<&ShapeRow>,
+    ) -> Result<Placed> {
+        let mut stages_ms = described.stages_ms;
+        let mut clock = Instant::now();
+        let mut lap = |name: &str| {
+            stages_ms.push((name.to_string(), clock.elapsed().as_secs_f64() * 1e3));
+            clock = Instant::now();
+        };
+        let description = described.description;
+        let view = description.view();
+        let digest = described.digest;
+        let object = self.store.objects().put_description(digest, &description, &described.params_json)?;
+        lap("store");
+        if let Some(old) = replaced {
+            self.forget(lane, old)?;
+        }
+        let mut n_relabelled = 0;
+        let (mut maps, mut sources, mut labelling) = (Vec::new(), Vec::new(), None);
+        if lane.learnt.is_some() {
+            let nearest = lane.nearest(view.signature, view.n_descriptors, MAX_MAPS);
+            for &(at, _) in &nearest {
+                n_relabelled += u32::from(self.relabel(lane, at)?);
+            }
+            if let Some(learnt) = &lane.learnt {
+                let known: Vec<Known> =
+                    nearest.iter().map(|(at, _)| self.known(lane.shapes[*at].id)).collect::<Result<_>>()?;
+                let carried = carry(&view, learnt, &known);
+                sources = sources_of(&known, &carried.labelling.weights);
+                maps = known.iter().map(|k| k.row.id).zip(carried.maps).collect();
+                labelling = Some(carried.labelling);
+            }
+        }
+        lap("place");
+        let due = lane.shapes.len() as u64 + 1 >= lane.state.next_recluster;
+        let plan = match (labelling, &lane.learnt) {
+            (Some(labelling), Some(learnt)) if !due => grown(lane, learnt, labelling, &view),
+            (labelling, _) => self.reclustered(lane, &view, labelling)?,
+        };
+        lap("recluster");
+        n_relabelled += plan.relabelled.len() as u32;
+        let original = || self.original_bytes(&accepted.item.original_digest);
+        let labels = self.finish_labels(
+            &view,
+            &plan.labelling,
+            &plan.learnt.model.labels,
+            (&original, &accepted.item.format),
+        )?;
+        let relabelled = self.finish_relabelled(&plan)?;
+        lap("boundary");
+        let shape = NewShapeRow {
+            collection: lane.row.id,
+            name: accepted.item.name.clone(),
+            ordinal: lane.row.next_ordinal,
+            content_digest: accepted.item.original_digest,
+            format: accepted.item.format.clone(),
+            description_digest: digest,
+            n_polygons: view.face_map.len() as u64,
+            area: description.area,
+            report_json: super::rows::report_to_json(&description.report).to_string(),
+            version: replaced.map_or(0, |old| old.version),
+            signature: description.signature.clone(),
+            stored_bytes: object.length + self.object_length(&accepted.item.original_digest)?,
+        };
+        let placed = Placed {
+            outcome: if replaced.is_some() { Outcome::Replaced } else { Outcome::Added },
+            version: shape.version + 1,
+            sequence: 0,
+            n_maps: maps.len() as u32,
+            n_relabelled,
+            stages_ms,
+        };
+        let commit = Commit { object, shape, labels, sources, maps, relabelled, replaced, accepted, placed, plan };
+        let placed = self.commit(lane, commit, description.signature)?;
+        self.note(&placed);
+        Ok(placed)
+    }
+
+    /// A stored shape with its arrays and newest labels.
+    pub(super) fn known(&self, id: ShapeId) -> Result<Known> {
+        let gone = |what: &str| damaged("shapes", &format!("{what} of row {id} is gone"));
+        let (row, object, labels) = self.store.catalog().read(|r| -> Result<_> {
+            let row = r.shape(id)?.ok_or_else(|| gone("name"))?;
+            let object = r.object(ObjectKind::Description, &row.description_digest)?;
+            let labels = r.newest_labels(id)?.ok_or_else(|| gone("newest labels"))?;
+            Ok((row, object.ok_or_else(|| gone("description"))?, labels))
+        })?;
+        let mapped = self.store.objects().open_description(&object)?;
+        Ok(Known { row, mapped, labels })
+    }
+
+    /// Clusters the parts of the representatives and the new shape anew.
+    fn reclustered(
+        &self,
+        lane: &mut Lane,
+        view: &DescriptionView<'_>,
+        labelling: Option<Labelling>,
+    ) -> Result<Plan> {
+        let chosen = lane.representatives(MAX_REPRESENTATIVES);
+        for &at in &chosen {
+            self.relabel(lane, at)?;
+        }
+        let known: Vec<Known> =
+            chosen.iter().map(|at| self.known(lane.shapes[*at].id)).collect::<Result<_>>()?;
+        let old = lane.learnt.as_ref().map(|l| &l.model);
+        let ids = |labelling: &Labelling| -> Vec<u32> {
+            let labels = old.map_or(&[][..], |m| &m.labels);
+            labelling.classes.iter().map(|c| labels[*c as usize]).collect()
+        };
+        let new_ids = labelling.as_ref().map(ids).unwrap_or_default();
+        let known_ids: Vec<Vec<u32>> =
+            known.iter().map(|k| k.labels.proxy_labels.iter().map(|l| *l as u32).collect()).collect();
+        let mut shapes: Vec<Representative<'_>> = known
+            .iter()
+            .zip(&known_ids)
+            .map(|(k, labels)| Representative { shape: k.mapped.view(), labels })
+            .collect();
+        shapes.push(Representative { shape: *view, labels: &new_ids });
+        let n_labels = lane.row.n_parts.map(|n| n as usize);
+        let options = ReclusterOptions {
+            discovery: DiscoveryOptions { n_labels, ..DiscoveryOptions::default() },
+            up: lane.up(),
+            always: shapes.len() <= TOO_FEW,
+            next_label: lane.row.next_label,
+        };
+        let epoch = old.map_or(0, |m| m.epoch) + 1;
+        let outcome = recluster(&shapes, old, epoch, &options);
+        let mut labellings = outcome.labellings;
+        let Some(labelling) = labellings.pop() else { unreachable!("the new shape is the last representative") };
+        let ordinals = chosen.iter().map(|at| lane.shapes[*at].ordinal).chain([lane.row.next_ordinal]);
+        let n_shapes = lane.shapes.len() as u64 + 1;
+        let state = CollectionState {
+            next_recluster: (n_shapes + 1).max((n_shapes as f64 * RECLUSTER_GROWTH).round() as u64),
+            representatives: ordinals.collect(),
+            epoch_ordinal: lane.row.next_ordinal,
+        };
+        let relabelled =
+            if outcome.accepted { known.into_iter().zip(labellings).collect() } else { Vec::new() };
+        Ok(Plan {
+            learnt: Learnt::begin(outcome.model),
+            state,
+            labelling,
+            relabelled,
+            changes: outcome.changes,
+            reclustered: Some((outcome.scores.0, outcome.scores.1, outcome.accepted)),
+        })
+    }
+
+    /// Takes a shape out of the lane, before it is replaced or removed.
+    pub(super) fn forget(&self, lane: &mut Lane, shape: &ShapeRow) -> Result<()> {
+        let Some(at) = lane.shapes.iter().position(|s| s.id == shape.id) else {
+            return Ok(());
+        };
+        let informs = lane.informs(&lane.shapes[at]);
+        if let Some(learnt) = lane.learnt.as_mut().filter(|_| informs) {
+            let known = self.known(shape.id)?;
+            let view = known.mapped.view();
+            let prepared = Prepared::new(&view, &learnt.model);
+            let classes = classes_of(&known.labels.proxy_labels, &learnt.model.labels);
+            let given = Labelling::given(classes, &prepared, &learnt.model);
+            let statistics = given.statistics(&prepared, learnt.model.labels.len());
+            learnt.model.statistics.accumulate(&statistics, -1.0);
+        }
+        lane.shapes.remove(at);
+        Ok(())
+    }
+}
+
+/// An addition that is no occasion to cluster anew.
+fn grown(lane: &Lane, learnt: &Learnt, labelling: Labelling, view: &DescriptionView<'_>) -> Plan {
+    let mut learnt = learnt.clone();
+    let prepared = Prepared::new(view, &learnt.model);
+    let statistics = labelling.statistics(&prepared, learnt.model.labels.len());
+    learnt.model.statistics.accumulate(&statistics, 1.0);
+    Plan {
+        learnt,
+        state: lane.state.clone(),
+        labelling,
+        relabelled: Vec::new(),
+        changes: Vec::new(),
+        reclustered: None,
+    }
+}
+
+/// A labelling with the maps it was carried through.
+struct Carried {
+    labelling: Labelling,
+    maps: Vec<FunctionalMap>,
+}
+
+/// Maps every known shape to the new one and labels it.
+fn carry(view: &DescriptionView<'_>, learnt: &Learnt, known: &[Known]) -> Carried {
+    let model = &learnt.model;
+    let prepared = Prepared::new(view, model);
+    let maps: Vec<FunctionalMap> = known
+        .iter()
+        .map(|k| {
+            let from = k.mapped.view();
+            let source = Prepared::new(&from, model);
+            map((&from, &source), (view, &prepared), &MapOptions::default())
+        })
+        .collect();
+    let views: Vec<DescriptionView<'_>> = known.iter().map(|k| k.mapped.view()).collect();
+    let votes: Vec<Vote<'_>> = known
+        .iter()
+        .zip(&views)
+        .zip(&maps)
+        .map(|((k, v), m)| Vote {
+            faces: v.faces,
+            probabilities: &k.labels.proxy_probabilities,
+            p2p: &m.p2p_21,
+            residual: m.quality.descriptor_residual,
+        })
+        .collect();
+    let labelling = label(view, &prepared, model, &votes);
+    Carried { labelling, maps }
+}
+
+/// The sources of a labelling with the weights of their votes.
+pub(super) fn sources_of(known: &[Known], weights: &[f64]) -> Vec<Source> {
+    known
+        .iter()
+        .zip(weights)
+        .map(|(k, w)| Source { shape: k.row.name.clone(), version: k.row.version, weight: *w })
+        .collect()
+}
+
+/// Classes of a model, given label ids; an id the model does not know counts as the first class.
+pub(super) fn classes_of(ids: &[i32], labels: &[u32]) -> Vec<u32> {
+    ids.iter()
+        .map(|id| labels.iter().position(|l| i64::from(*l) == i64::from(*id)).unwrap_or(0) as u32)
+        .collect()
+}
+
+impl KnownShape {
+    /// The shape as it is when it has just been labelled.
+    pub(super) fn fresh(id: ShapeId, ordinal: u64, signature: Vec<f32>) -> Self {
+        Self { id, ordinal, stale: false, signature }
+    }
+}

@@ -1,0 +1,126 @@
+//! What the catalog keeps as text becomes domain values and back.
+
+use super::{LibraryError, Result};
+use crate::fmap::Quality;
+use crate::mesh::{CleanReport, Format};
+use crate::operators::Operator;
+use crate::store::StoreError;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+/// What a collection keeps besides its model.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct CollectionState {
+    /// Number of shapes at which the parts are clustered anew.
+    pub(super) next_recluster: u64,
+    /// Ordinals of the shapes that were clustered together when the epoch began.
+    pub(super) representatives: Vec<u64>,
+    /// Newest ordinal when the epoch began.
+    pub(super) epoch_ordinal: u64,
+}
+
+pub(super) fn to_json<T: Serialize>(value: &T) -> String {
+    serde_json::to_string(value).expect("invariant: plain values serialise")
+}
+
+pub(super) fn from_json<'a, T: Deserialize<'a>>(text: &'a str, place: &str) -> Result<T> {
+    serde_json::from_str(text).map_err(|e| damaged(place, &e.to_string()))
+}
+
+/// A row of the catalog that does not hold what was written.
+pub(super) fn damaged(place: &str, message: &str) -> LibraryError {
+    StoreError::Damaged { path: place.to_string(), message: message.to_string() }.into()
+}
+
+/// A clean report as JSON.
+pub fn report_to_json(report: &CleanReport) -> Value {
+    Value::Object(report.counts().into_iter().map(|(name, n)| (name.into(), json!(n))).collect())
+}
+
+pub(super) fn report_from_json(text: &str, place: &str) -> Result<CleanReport> {
+    let value: Value = from_json(text, place)?;
+    CleanReport::from_counts(|name| {
+        let n = value.get(name).and_then(Value::as_u64);
+        n.map(|n| n as usize).ok_or_else(|| damaged(place, &format!("no count {name:?}")))
+    })
+}
+
+pub(super) fn quality_to_json(q: &Quality) -> String {
+    json!({
+        "descriptor_residual": q.descriptor_residual,
+        "orthogonality": q.orthogonality,
+        "coverage": q.coverage,
+        "near_zero": q.near_zero,
+    })
+    .to_string()
+}
+
+pub(super) fn quality_from_json(text: &str, place: &str) -> Result<Quality> {
+    let value: Value = from_json(text, place)?;
+    let number = |name: &str| -> Result<f64> {
+        value.get(name).and_then(Value::as_f64).ok_or_else(|| damaged(place, &format!("no number {name:?}")))
+    };
+    Ok(Quality {
+        descriptor_residual: number("descriptor_residual")?,
+        orthogonality: number("orthogonality")?,
+        coverage: number("coverage")?,
+        near_zero: number("near_zero")?,
+    })
+}
+
+/// The stored word of an operator.
+pub(super) fn operator_name(operator: Operator) -> &'static str {
+    match operator {
+        Operator::Tufted => "tufted",
+        Operator::Cotan => "cotan",
+        Operator::MeshLaplace => "mesh-laplace",
+    }
+}
+
+pub(super) fn operator_from_name(name: &str, place: &str) -> Result<Operator> {
+    let all = [Operator::Tufted, Operator::Cotan, Operator::MeshLaplace];
+    let found = all.into_iter().find(|o| operator_name(*o) == name);
+    found.ok_or_else(|| damaged(place, &format!("no operator is named {name:?}")))
+}
+
+/// The stored word of a format.
+pub(super) fn format_name(format: Format) -> &'static str {
+    match format {
+        Format::Obj => "obj",
+        Format::Off => "off",
+    }
+}
+
+pub(super) fn format_from_name(name: &str, place: &str) -> Result<Format> {
+    let found = [Format::Obj, Format::Off].into_iter().find(|f| format_name(*f) == name);
+    found.ok_or_else(|| damaged(place, &format!("no format is named {name:?}")))
+}
+
+/// Colours of labels, by id: Okabe and Ito's eight, which colour-blind people can tell apart, then golden-angle
+/// hues.
+pub(super) fn label_colour(id: u32) -> [u8; 3] {
+    const OKABE_ITO: [[u8; 3]; 8] = [
+        [230, 159, 0],
+        [86, 180, 233],
+        [0, 158, 115],
+        [240, 228, 66],
+        [0, 114, 178],
+        [213, 94, 0],
+        [204, 121, 167],
+        [128, 128, 128],
+    ];
+    if let Some(colour) = OKABE_ITO.get(id as usize) {
+        return *colour;
+    }
+    let hue = f64::from(id) * 137.507_764 % 360.0 / 60.0;
+    let x = 1.0 - (hue % 2.0 - 1.0).abs();
+    let (r, g, b) = match hue as u32 {
+        0 => (1.0, x, 0.0),
+        1 => (x, 1.0, 0.0),
+        2 => (0.0, 1.0, x),
+        3 => (0.0, x, 1.0),
+        4 => (x, 0.0, 1.0),
+        _ => (1.0, 0.0, x),
+    };
+    [r, g, b].map(|c| (60.0 + 170.0 * c) as u8)
+}

@@ -1,0 +1,421 @@
+//! Shapes are accepted, described and placed; each request takes effect once.
+
+use super::collections::check_name;
+use super::rows::{damaged, format_from_name, format_name, from_json, operator_from_name, to_json};
+use super::{
+    Described, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError, NewShape, Outcome, Placed,
+    RequestKey, Result,
+};
+use crate::mesh::{CleanError, ParseError};
+use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, describe};
+use crate::spectrum::SpectrumError;
+use crate::store::{
+    CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, RequestRow, ShapeRow, Tx,
+};
+use std::cell::RefCell;
+use std::sync::PoisonError;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+const MAX_SHAPE_NAME: usize = 255;
+
+impl Library {
+    /// Accepts shapes: when this returns their bytes and a job are durable. The same key gives the same job again.
+    ///
+    /// # Errors
+    /// No such collection, a bad name, or a key that was used for another request.
+    pub fn submit(
+        &self,
+        collection: &str,
+        shapes: Vec<NewShape>,
+        key: Option<&RequestKey>,
+    ) -> Result<Job> {
+        let mut request = blake3::Hasher::new();
+        request.update(format!("submit {collection:?} {}", shapes.len()).as_bytes());
+        for s in &shapes {
+            check_name("shape", &s.name, MAX_SHAPE_NAME)?;
+            let what = format!("{:?} {} {}", s.name, format_name(s.format), s.replace);
+            request.update(what.as_bytes()).update(&Digest::of(&s.bytes).0);
+        }
+        let request = Digest(*request.finalize().as_bytes());
+        self.collection_row(collection)?;
+        let mut objects = Vec::new();
+        let mut items = Vec::new();
+        for s in shapes {
+            let object = self.store.objects().put_original(&s.bytes)?;
+            items.push(NewJobItem {
+                name: s.name,
+                original_digest: object.digest,
+                format: format_name(s.format).into(),
+                replace: s.replace,
+            });
+            objects.push(object);
+        }
+        let reply = self.once(key, request, |tx| {
+            for object in &objects {
+                tx.insert_object(object)?;
+            }
+            let job = tx.insert_job(collection, unix_secs(), &items)?;
+            Ok(job.to_le_bytes().to_vec())
+        })?;
+        let id = reply.as_slice().try_into().map(u64::from_le_bytes);
+        self.job(id.map_err(|_| damaged("requests", "the reply is no job id"))?)
+    }
+
+    /// A job as it stands.
+    ///
+    /// # Errors
+    /// There is none of the id.
+    pub fn job(&self, id: u64) -> Result<Job> {
+        let (job, items) = self.store.catalog().read(|r| -> Result<_> {
+            let job = r.job(id)?;
+            let job =
+                job.ok_or_else(|| LibraryError::NotFound { what: "job", name: id.to_string() })?;
+            Ok((job, r.job_items(id)?))
+        })?;
+        let items = items.into_iter().map(|i| self.item(i)).collect::<Result<_>>()?;
+        Ok(Job { id, collection: job.collection, items })
+    }
+
+    /// Items not yet done, in order of acceptance: what a daemon takes up again when it starts.
+    ///
+    /// # Errors
+    /// The catalog cannot be read.
+    pub fn queued_items(&self) -> Result<Vec<JobItem>> {
+        let rows = self.store.catalog().read(|r| r.queued_items().map_err(LibraryError::from))?;
+        rows.into_iter().map(|i| self.item(i)).collect()
+    }
+
+    /// Cancels the items of a job that are not done.
+    ///
+    /// # Errors
+    /// There is no such job.
+    pub fn cancel(&self, job: u64) -> Result<Job> {
+        self.job(job)?;
+        self.store.catalog().write(|tx| -> Result<()> {
+            for item in tx.job_items(job)?.iter().filter(|i| i.status == ItemStatus::Queued) {
+                tx.set_item(job, item.index, ItemStatus::Cancelled, None)?;
+            }
+            Ok(())
+        })?;
+        self.job(job)
+    }
+
+    /// Bytes of an item's file, for whoever plans its memory.
+    ///
+    /// # Errors
+    /// There is no such item, or the catalog cannot be read.
+    pub fn item_bytes(&self, item: &JobItem) -> Result<u64> {
+        self.object_length(&self.item_row(item)?.item.original_digest)
+    }
+
+    /// Whether placing an item would need its description now: not when the same bytes are there under its
+    /// name, or others that it may not replace. Either may change until the items before it are placed.
+    ///
+    /// # Errors
+    /// There is no such item or collection, or the catalog cannot be read.
+    pub fn needs_description(&self, item: &JobItem) -> Result<bool> {
+        let row = self.item_row(item)?;
+        let id = self.collection_row(&item.collection)?.id;
+        let existing = self.store.catalog().read(|r| -> Result<Option<ShapeRow>> {
+            Ok(r.shape_by_name(id, &item.name)?)
+        })?;
+        let replaced = |shape: ShapeRow| {
+            row.item.replace && shape.content_digest != row.item.original_digest
+        };
+        Ok(row.status == ItemStatus::Queued && existing.is_none_or(replaced))
+    }
+
+    /// The pure stage of an item, on any thread. `stage` is told each stage's name as it begins; when it returns
+    /// false the work stops.
+    ///
+    /// # Errors
+    /// Why the shape is refused, or why it was stopped.
+    pub fn describe_item(
+        &self,
+        item: &JobItem,
+        stage: &dyn Fn(&str) -> bool,
+    ) -> std::result::Result<Described, Failure> {
+        let key = (item.job, item.index);
+        let described = self.describe_bytes(item, stage);
+        self.running.lock().unwrap_or_else(PoisonError::into_inner).remove(&key);
+        described
+    }
+
+    fn describe_bytes(
+        &self,
+        item: &JobItem,
+        stage: &dyn Fn(&str) -> bool,
+    ) -> std::result::Result<Described, Failure> {
+        let row = self.item_row(item).map_err(|e| failure(&e))?;
+        let collection = self.collection_row(&item.collection).map_err(|e| failure(&e))?;
+        let (params, params_json) = params_of(&collection).map_err(|e| failure(&e))?;
+        let bytes = self.original_bytes(&row.item.original_digest).map_err(|e| failure(&e))?;
+        let format =
+            format_from_name(&row.item.format, "job_items.format").map_err(|e| failure(&e))?;
+        let laps = RefCell::new((Vec::<(String, f64)>::new(), Instant::now()));
+        let lap = || {
+            let (stages, since) = &mut *laps.borrow_mut();
+            if let Some(last) = stages.last_mut() {
+                last.1 += since.elapsed().as_secs_f64() * 1e3;
+            }
+            *since = Instant::now();
+        };
+        let observed = |name: &str| {
+            if laps.borrow().0.last().is_some_and(|last| last.0 == name) {
+                return stage(name);
+            }
+            lap();
+            let mut running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
+            running.insert((item.job, item.index), name.to_string());
+            drop(running);
+            laps.borrow_mut().0.push((name.to_string(), 0.0));
+            stage(name)
+        };
+        let description = describe(&bytes, format, &params, &observed).map_err(|e| refusal(&e))?;
+        lap();
+        let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm());
+        let stages_ms = laps.into_inner().0;
+        Ok(Described { description, stages_ms, digest, params_json })
+    }
+
+    /// Places a described item and commits it, or commits that it failed. To be called in the order of acceptance
+    /// within a collection.
+    ///
+    /// # Errors
+    /// The store fails; a shape that is refused is an [`ItemState::Failed`].
+    pub fn place_item(
+        &self,
+        item: &JobItem,
+        described: std::result::Result<Described, Failure>,
+    ) -> Result<ItemState> {
+        let Ok(collection) = self.collection_row(&item.collection) else {
+            let name = item.collection.clone();
+            let gone = LibraryError::NotFound { what: "collection", name };
+            return self.fail(item, failure(&gone));
+        };
+        self.with_lane(collection, |lane| {
+            let row = self.item_row(item)?;
+            if row.status != ItemStatus::Queued {
+                return Ok(self.item(row)?.state);
+            }
+            let read = |name: &str| {
+                let id = lane.row.id;
+                self.store.catalog().read(|r| r.shape_by_name(id, name).map_err(LibraryError::from))
+            };
+            let existing: Option<ShapeRow> = read(&item.name)?;
+            match &existing {
+                Some(shape) if shape.content_digest == row.item.original_digest => {
+                    let placed = Placed {
+                        outcome: Outcome::Unchanged,
+                        version: shape.version,
+                        sequence: lane.row.sequence,
+                        n_maps: 0,
+                        n_relabelled: 0,
+                        stages_ms: Vec::new(),
+                    };
+                    self.store.catalog().write(|tx| -> Result<()> {
+                        let detail = to_json(&placed);
+                        Ok(tx.set_item(item.job, item.index, ItemStatus::Done, Some(&detail))?)
+                    })?;
+                    return Ok(ItemState::Done(Box::new(placed)));
+                }
+                Some(_) if !row.item.replace => return self.fail(item, taken(item)),
+                _ => {}
+            }
+            match described {
+                Err(why) => self.fail(item, why),
+                Ok(described) => {
+                    let placed = self.place_described(lane, &row, described, existing.as_ref())?;
+                    Ok(ItemState::Done(Box::new(placed)))
+                }
+            }
+        })
+    }
+
+    /// Submits, describes and places one shape, for use in process.
+    ///
+    /// # Errors
+    /// As [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
+    pub fn add(&self, collection: &str, shape: NewShape) -> Result<Placed> {
+        let job = self.submit(collection, vec![shape], None)?;
+        let item = &job.items[0];
+        match self.place_item(item, self.describe_item(item, &|_| true))? {
+            ItemState::Done(placed) => Ok(*placed),
+            ItemState::Failed(why) => Err(LibraryError::Refused(why)),
+            ItemState::Queued | ItemState::Running(_) | ItemState::Cancelled => {
+                Err(LibraryError::FailedPrecondition {
+                    reason: "CANCELLED",
+                    message: format!("job {} was cancelled", job.id),
+                })
+            }
+        }
+    }
+
+    /// Runs a change unless its key was answered before; the reply, then or now.
+    pub(super) fn once(
+        &self,
+        key: Option<&RequestKey>,
+        request: Digest,
+        change: impl FnOnce(&Tx<'_>) -> Result<Vec<u8>>,
+    ) -> Result<Vec<u8>> {
+        self.store.catalog().write(|tx| {
+            let Some(key) = key else { return change(tx) };
+            if let Some(row) = tx.request(&key.client_id, &key.request_id)? {
+                if row.request_digest != request {
+                    return Err(LibraryError::FailedPrecondition {
+                        reason: "REQUEST_ID_REUSED",
+                        message: format!(
+                            "client {:?} used request id {:?} for another request before",
+                            key.client_id, key.request_id
+                        ),
+                    });
+                }
+                return Ok(row.reply);
+            }
+            let reply = change(tx)?;
+            tx.put_request(&RequestRow {
+                client_id: key.client_id.clone(),
+                request_id: key.request_id.clone(),
+                request_digest: request,
+                reply: reply.clone(),
+                created_unix_secs: unix_secs(),
+            })?;
+            Ok(reply)
+        })
+    }
+
+    pub(super) fn object_length(&self, original: &Digest) -> Result<u64> {
+        Ok(self.object(ObjectKind::Original, original)?.length)
+    }
+
+    fn fail(&self, item: &JobItem, why: Failure) -> Result<ItemState> {
+        let cancelled = why.code == "CANCELLED";
+        let status = if cancelled { ItemStatus::Cancelled } else { ItemStatus::Failed };
+        self.store.catalog().write(|tx| -> Result<()> {
+            Ok(tx.set_item(item.job, item.index, status, Some(&to_json(&why)))?)
+        })?;
+        Ok(if cancelled { ItemState::Cancelled } else { ItemState::Failed(why) })
+    }
+
+    fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
+        let rows =
+            self.store.catalog().read(|r| r.job_items(item.job).map_err(LibraryError::from))?;
+        let row = rows.into_iter().find(|r| r.index == item.index);
+        row.ok_or_else(|| LibraryError::NotFound {
+            what: "job item",
+            name: format!("{} of job {}", item.index, item.job),
+        })
+    }
+
+    fn item(&self, row: JobItemRow) -> Result<JobItem> {
+        let place = format!("job_items {}, {}", row.job, row.index);
+        let detail = || row.detail_json.as_deref().ok_or_else(|| damaged(&place, "no detail"));
+        let state = match row.status {
+            ItemStatus::Queued => {
+                let running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
+                let stage = running.get(&(row.job, row.index)).cloned();
+                stage.map_or(ItemState::Queued, ItemState::Running)
+            }
+            ItemStatus::Done => ItemState::Done(Box::new(from_json(detail()?, &place)?)),
+            ItemStatus::Failed => ItemState::Failed(from_json(detail()?, &place)?),
+            ItemStatus::Cancelled => ItemState::Cancelled,
+        };
+        Ok(JobItem {
+            job: row.job,
+            index: row.index,
+            collection: row.collection,
+            name: row.item.name,
+            state,
+        })
+    }
+}
+
+fn unix_secs() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
+}
+
+/// What decides the bits of a description besides bytes and parameters: the algorithm, and the instruction set that
+/// the kernels choose at run time.
+fn algorithm() -> String {
+    format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new())
+}
+
+/// The parameters of a collection's descriptions, and the text that names them.
+fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
+    let operator = operator_from_name(&row.operator, &format!("collections {}", row.name))?;
+    let params = Params { operator, working_faces: row.working_faces, ..Params::default() };
+    let json = serde_json::json!({
+        "operator": row.operator,
+        "working_faces": params.working_faces,
+        "n_eigenpairs": params.n_eigenpairs,
+    });
+    Ok((params, json.to_string()))
+}
+
+fn taken(item: &JobItem) -> Failure {
+    Failure {
+        code: "ALREADY_EXISTS".into(),
+        reason: "NAME_TAKEN".into(),
+        message: format!(
+            "collection {:?} has a shape named {:?} with other bytes; replace it or choose another name",
+            item.collection, item.name
+        ),
+        subject: None,
+    }
+}
+
+/// An error of the library as the failure of an item.
+fn failure(error: &LibraryError) -> Failure {
+    let (code, reason) = match error {
+        LibraryError::InvalidArgument { reason, .. } => ("INVALID_ARGUMENT", *reason),
+        LibraryError::NotFound { .. } => ("NOT_FOUND", "GONE"),
+        LibraryError::AlreadyExists { reason, .. } => ("ALREADY_EXISTS", *reason),
+        LibraryError::FailedPrecondition { reason, .. } => ("FAILED_PRECONDITION", *reason),
+        LibraryError::Refused(failure) => return failure.clone(),
+        LibraryError::Store(e) if e.is_damage() => ("DATA_LOSS", "DAMAGED"),
+        LibraryError::Store(_) => ("INTERNAL", "STORE"),
+    };
+    Failure { code: code.into(), reason: reason.into(), message: error.to_string(), subject: None }
+}
+
+/// Why a mesh could not be described, as the failure of an item.
+fn refusal(error: &DescribeError) -> Failure {
+    let (code, reason) = match error {
+        DescribeError::Parse(e) => ("INVALID_ARGUMENT", parse_reason(e)),
+        DescribeError::Clean(CleanError::AllDegenerate { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),
+        DescribeError::Clean(_) => ("INVALID_ARGUMENT", "MESH"),
+        DescribeError::Laplacian(_) => ("INVALID_ARGUMENT", "LAPLACIAN"),
+        DescribeError::Spectrum(SpectrumError::Cancelled { .. }) => ("CANCELLED", "CANCELLED"),
+        DescribeError::Spectrum(_) => ("INTERNAL", "SPECTRUM"),
+        DescribeError::Cancelled(_) => ("CANCELLED", "CANCELLED"),
+    };
+    let subject = match error {
+        DescribeError::Parse(e) => parse_subject(e),
+        _ => None,
+    };
+    Failure { code: code.into(), reason: reason.into(), message: error.to_string(), subject }
+}
+
+fn parse_reason(error: &ParseError) -> &'static str {
+    match error {
+        ParseError::VertexOutOfRange { .. } => "VERTEX_INDEX",
+        ParseError::NonFinite { .. } => "NON_FINITE_VERTEX",
+        ParseError::TooManyTriangles => "MESH_TOO_LARGE",
+        _ => "PARSE",
+    }
+}
+
+/// Where in the file, if it is one place.
+fn parse_subject(error: &ParseError) -> Option<FailureSubject> {
+    match error {
+        ParseError::NotANumber { line, .. }
+        | ParseError::ShortVertex { line, .. }
+        | ParseError::EmptyFace { line, .. }
+        | ParseError::ShortFace { line, .. }
+        | ParseError::Trailing { line, .. } => Some(FailureSubject::Line(*line as u64)),
+        ParseError::PolygonTooLarge { face, .. }
+        | ParseError::VertexOutOfRange { face, .. }
+        | ParseError::NonFinite { face, .. } => Some(FailureSubject::Face(*face as u64)),
+        _ => None,
+    }
+}

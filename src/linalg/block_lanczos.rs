@@ -1,0 +1,349 @@
+//! A symmetric operator on panels becomes its block tridiagonal projection on a Krylov space, whose
+//! eigenpairs approximate those of largest magnitude.
+//!
+//! Block Lanczos with 16 columns and full re-orthogonalisation: no restart, no ghost copies, and
+//! every inner loop is a matrix product (Golub and Underwood 1977; Grimes, Lewis and Simon, *A
+//! Shifted Block Lanczos Algorithm*, 1994).
+
+// Small matrices and register tiles read best with their indices.
+#![allow(clippy::needless_range_loop)]
+
+use super::dense_eigen::{DenseEigenError, symmetric_eigen};
+use super::panel::{
+    Basis, Row, Tile, WIDTH, ZERO_TILE, gram, multiply_in_place, tile_product, zero_panel,
+};
+use faer::Mat;
+use rand::{Rng, SeedableRng};
+use rand_pcg::Pcg64;
+
+/// Below this ratio of a column's length after and before orthogonalisation it counts as lost: the
+/// Krylov space is exhausted in that direction and a random one takes its place.
+const LOST: f64 = 1e-11;
+
+/// A second orthogonalisation follows when a column shrank by more than this.
+const SHRUNK: f64 = 1e-3;
+
+/// The vectors found fill the whole space: no further direction exists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a space of {n} dimensions has no direction beyond the {n_found} found")]
+pub struct Exhausted {
+    /// Dimension of the space.
+    pub n: usize,
+    /// Vectors in the basis.
+    pub n_found: usize,
+}
+
+/// A Krylov space under construction.
+pub struct BlockLanczos<'a> {
+    n: usize,
+    basis: Basis,
+    /// Vectors that the space stays orthogonal to.
+    locked: &'a Basis,
+    /// Diagonal and subdiagonal tiles of the projection.
+    diagonal: Vec<Tile>,
+    subdiagonal: Vec<Tile>,
+    next: Vec<Row>,
+    random: Pcg64,
+}
+
+/// Eigenpairs of the projection.
+pub struct Projection {
+    /// Ritz values `(m,)`, ascending.
+    pub values: Vec<f64>,
+    /// `(m, m)`.
+    vectors: Mat<f64>,
+    /// Length of the residual of each Ritz pair.
+    pub residuals: Vec<f64>,
+}
+
+impl<'a> BlockLanczos<'a> {
+    /// Starts from a random block orthogonal to `locked`.
+    pub fn new(
+        n: usize,
+        locked: &'a Basis,
+        capacity: usize,
+        seed: u64,
+        parallel: bool,
+    ) -> Result<Self, Exhausted> {
+        let mut this = Self {
+            n,
+            basis: Basis::new(n, capacity, parallel),
+            locked,
+            diagonal: Vec::new(),
+            subdiagonal: Vec::new(),
+            next: zero_panel(n),
+            random: Pcg64::seed_from_u64(seed),
+        };
+        for row in &mut this.next[..n] {
+            for x in &mut row.0 {
+                *x = this.random.random::<f64>() - 0.5;
+            }
+        }
+        let scale = column_lengths(&this.next);
+        let mut next = std::mem::take(&mut this.next);
+        this.locked.remove(0, &mut next);
+        this.orthonormalise(&mut next, &scale)?;
+        this.next = next;
+        Ok(this)
+    }
+
+    /// Vectors in the space.
+    pub fn dimension(&self) -> usize {
+        self.diagonal.len() * WIDTH
+    }
+
+    /// Adds one block: applies `operator` in place to the newest one.
+    pub fn step(&mut self, operator: &dyn Fn(&mut [Row])) -> Result<(), Exhausted> {
+        let mut w = std::mem::take(&mut self.next);
+        self.basis.push(&w);
+        operator(&mut w);
+        let scale = column_lengths(&w);
+        let last = self.basis.n_panels() - 1;
+        // The three-term recurrence first, so that the full pass only meets rounding errors.
+        let local = self.basis.remove(last.saturating_sub(1), &mut w);
+        self.locked.remove(0, &mut w);
+        let full = self.basis.remove(0, &mut w);
+        let mut diagonal = ZERO_TILE;
+        let (a, b) = (&local[local.len() - 1], &full[last]);
+        for i in 0..WIDTH {
+            for j in 0..WIDTH {
+                let both = a[i].0[j] + b[i].0[j] + a[j].0[i] + b[j].0[i];
+                diagonal[i].0[j] = 0.5 * both;
+            }
+        }
+        self.diagonal.push(diagonal);
+        let r = self.orthonormalise(&mut w, &scale)?;
+        self.subdiagonal.push(r);
+        self.next = w;
+        Ok(())
+    }
+
+    /// Makes the columns of `w` orthonormal among themselves (and again to the basis, if they
+    /// shrank much); returns R of `w = Q R`. Columns lost to rounding become random directions with
+    /// a zero column on the diagonal of R.
+    fn orthonormalise(&mut self, w: &mut [Row], scale: &[f64; WIDTH]) -> Result<Tile, Exhausted> {
+        let mut total = identity();
+        let mut shrunk = false;
+        for pass in 0..3 {
+            let g = gram(w, w);
+            let Some((r, inverse)) = cholesky(&g) else {
+                return self.orthonormalise_slowly(w, scale, &total);
+            };
+            if pass == 0 {
+                if (0..WIDTH).any(|j| r[j].0[j] < LOST * scale[j]) {
+                    return self.orthonormalise_slowly(w, scale, &total);
+                }
+                shrunk = (0..WIDTH).any(|j| r[j].0[j] < SHRUNK * scale[j]);
+            }
+            multiply_in_place(w, &inverse);
+            total = tile_product(&r, &total);
+            if pass == 0 && shrunk {
+                self.locked.remove(0, w);
+                self.basis.remove(0, w);
+            }
+            if pass >= 1 && !(pass == 1 && shrunk) {
+                break;
+            }
+        }
+        Ok(total)
+    }
+
+    /// Column by column, for blocks of deficient rank.
+    fn orthonormalise_slowly(
+        &mut self,
+        w: &mut [Row],
+        scale: &[f64; WIDTH],
+        before: &Tile,
+    ) -> Result<Tile, Exhausted> {
+        let mut r = ZERO_TILE;
+        for j in 0..WIDTH {
+            let mut lost = false;
+            for attempt in 0..4 {
+                for _ in 0..2 {
+                    for i in 0..j {
+                        let dot: f64 = w.iter().map(|row| row.0[i] * row.0[j]).sum();
+                        for row in w.iter_mut() {
+                            row.0[j] -= dot * row.0[i];
+                        }
+                        if !lost {
+                            r[i].0[j] += dot;
+                        }
+                    }
+                    if lost {
+                        self.remove_from_column(w, j);
+                    }
+                }
+                let length = w.iter().map(|row| row.0[j] * row.0[j]).sum::<f64>().sqrt();
+                let enough = if lost {
+                    1e-6
+                } else {
+                    LOST * scale[j].max(f64::MIN_POSITIVE)
+                };
+                if length > enough {
+                    for row in w.iter_mut() {
+                        row.0[j] /= length;
+                    }
+                    if !lost {
+                        r[j].0[j] = length;
+                    }
+                    break;
+                }
+                if attempt == 3 {
+                    let n_found = self.dimension() + j;
+                    return Err(Exhausted { n: self.n, n_found });
+                }
+                lost = true;
+                for row in &mut w[..self.n] {
+                    row.0[j] = self.random.random::<f64>() - 0.5;
+                }
+                let length = w.iter().map(|row| row.0[j] * row.0[j]).sum::<f64>().sqrt();
+                for row in w.iter_mut() {
+                    row.0[j] /= length;
+                }
+                self.remove_from_column(w, j);
+            }
+        }
+        // A last pass against everything: small remainders were scaled up.
+        self.locked.remove(0, w);
+        self.basis.remove(0, w);
+        let g = gram(w, w);
+        let (again, inverse) = cholesky(&g).ok_or(Exhausted {
+            n: self.n,
+            n_found: self.dimension(),
+        })?;
+        multiply_in_place(w, &inverse);
+        Ok(tile_product(&again, &tile_product(&r, before)))
+    }
+
+    fn remove_from_column(&self, w: &mut [Row], j: usize) {
+        let mut single = vec![Row::ZERO; w.len()];
+        for (s, row) in single.iter_mut().zip(w.iter()) {
+            s.0[0] = row.0[j];
+        }
+        self.locked.remove(0, &mut single);
+        self.basis.remove(0, &mut single);
+        for (s, row) in single.iter().zip(w.iter_mut()) {
+            row.0[j] = s.0[0];
+        }
+    }
+
+    /// Eigenpairs of the block tridiagonal projection, O(m³).
+    pub fn projection(&self) -> Result<Projection, DenseEigenError> {
+        let (blocks, m) = (self.diagonal.len(), self.dimension());
+        let mut t = vec![0.0; m * m];
+        for b in 0..blocks {
+            for j in 0..WIDTH {
+                let column = (b * WIDTH + j) * m;
+                for i in 0..WIDTH {
+                    t[column + b * WIDTH + i] = self.diagonal[b][i].0[j];
+                    if b + 1 < blocks {
+                        t[column + (b + 1) * WIDTH + i] = self.subdiagonal[b][i].0[j];
+                    }
+                }
+            }
+        }
+        let (values, vectors) = symmetric_eigen(&t, m)?;
+        let residuals = (0..m)
+            .map(|e| {
+                self.coupled(&vectors, e)
+                    .iter()
+                    .map(|x| x * x)
+                    .sum::<f64>()
+                    .sqrt()
+            })
+            .collect();
+        Ok(Projection {
+            values,
+            vectors,
+            residuals,
+        })
+    }
+
+    /// Coefficients of the residual of Ritz pair `e` in the next block.
+    fn coupled(&self, vectors: &Mat<f64>, e: usize) -> [f64; WIDTH] {
+        let m = self.dimension();
+        let r = &self.subdiagonal[self.subdiagonal.len() - 1];
+        std::array::from_fn(|i| {
+            (0..WIDTH)
+                .map(|j| r[i].0[j] * vectors[(m - WIDTH + j, e)])
+                .sum()
+        })
+    }
+
+    /// Ritz vectors after one more application of the operator, which comes free: the panels of
+    /// `operator(V y) / θ`. Consumes the space.
+    pub fn vectors(mut self, projection: &Projection, selected: &[usize]) -> Vec<Vec<Row>> {
+        let blocks = self.diagonal.len();
+        let next = std::mem::take(&mut self.next);
+        self.basis.push(&next);
+        let coefficients: Vec<Vec<Tile>> = selected
+            .chunks(WIDTH)
+            .map(|group| {
+                let mut tiles = vec![ZERO_TILE; blocks + 1];
+                for (column, &e) in group.iter().enumerate() {
+                    for (b, tile) in tiles[..blocks].iter_mut().enumerate() {
+                        for (i, row) in tile.iter_mut().enumerate() {
+                            row.0[column] = projection.vectors[(b * WIDTH + i, e)];
+                        }
+                    }
+                    let coupled = self.coupled(&projection.vectors, e);
+                    for (row, x) in tiles[blocks].iter_mut().zip(coupled) {
+                        row.0[column] = x / projection.values[e];
+                    }
+                }
+                tiles
+            })
+            .collect();
+        self.basis.combinations(&coefficients)
+    }
+}
+
+fn identity() -> Tile {
+    let mut tile = ZERO_TILE;
+    for (i, row) in tile.iter_mut().enumerate() {
+        row.0[i] = 1.0;
+    }
+    tile
+}
+
+fn column_lengths(panel: &[Row]) -> [f64; WIDTH] {
+    let mut sums = [0.0; WIDTH];
+    for row in panel {
+        for (s, x) in sums.iter_mut().zip(&row.0) {
+            *s += x * x;
+        }
+    }
+    sums.map(f64::sqrt)
+}
+
+/// Upper triangular R with `G = RᵀR`, and its inverse; `None` if G is not safely definite.
+fn cholesky(g: &Tile) -> Option<(Tile, Tile)> {
+    let mut r = ZERO_TILE;
+    for j in 0..WIDTH {
+        let mut d = g[j].0[j];
+        for k in 0..j {
+            d -= r[k].0[j] * r[k].0[j];
+        }
+        if !d.is_finite() || d <= 1e-13 * g[j].0[j] || g[j].0[j] <= 0.0 {
+            return None;
+        }
+        let d = d.sqrt();
+        r[j].0[j] = d;
+        for i in j + 1..WIDTH {
+            let mut x = g[j].0[i];
+            for k in 0..j {
+                x -= r[k].0[j] * r[k].0[i];
+            }
+            r[j].0[i] = x / d;
+        }
+    }
+    let mut inverse = ZERO_TILE;
+    for j in 0..WIDTH {
+        inverse[j].0[j] = 1.0 / r[j].0[j];
+        for i in (0..j).rev() {
+            let x: f64 = (i + 1..=j).map(|k| r[i].0[k] * inverse[k].0[j]).sum();
+            inverse[i].0[j] = -x / r[i].0[i];
+        }
+    }
+    Some((r, inverse))
+}

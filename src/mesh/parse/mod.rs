@@ -1,0 +1,141 @@
+//! Bytes of a mesh file become polygons, triangulated as fans, in file order.
+//!
+//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers) and
+//! says where; what is merely dirty (degenerate faces, unused vertices) it passes on to `clean`.
+
+mod obj;
+mod off;
+
+use super::{Format, ParsedMesh};
+
+/// Corners a polygon may have; a face with more is a damaged file.
+pub const MAX_CORNERS: usize = 10_000;
+/// Triangles a mesh may have after triangulation.
+pub const MAX_TRIANGLES: usize = 50_000_000;
+
+/// Why bytes are not a mesh. Faces and vertices count from 0 in file order, lines from 1.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[allow(missing_docs)] // the fields are the values of the message
+pub enum ParseError {
+    #[error("the file has no faces")]
+    NoFaces,
+    #[error("line {line}: \"{token}\" is not a number")]
+    NotANumber { line: usize, token: String },
+    #[error("line {line}: a vertex has {found} coordinates, but 3 are needed")]
+    ShortVertex { line: usize, found: usize },
+    #[error("line {line}: face {face} has no corners, but at least 1 is needed")]
+    EmptyFace { line: usize, face: usize },
+    #[error("line {line}: face {face} has {found} corners, but declares {declared}")]
+    ShortFace {
+        line: usize,
+        face: usize,
+        found: usize,
+        declared: u64,
+    },
+    #[error("face {face} has {corners} corners, but at most {MAX_CORNERS} are read")]
+    PolygonTooLarge { face: usize, corners: u64 },
+    #[error("face {face} names vertex {vertex}, but the mesh has {n_vertices}")]
+    VertexOutOfRange {
+        face: usize,
+        vertex: i64,
+        n_vertices: usize,
+    },
+    #[error(
+        "face {face} has a corner at ({}, {}, {}), but coordinates must be finite",
+        position[0], position[1], position[2]
+    )]
+    NonFinite { face: usize, position: [f64; 3] },
+    #[error("the mesh has more than {MAX_TRIANGLES} triangles")]
+    TooManyTriangles,
+    #[error("the file begins with \"{found}\", which is not an OFF header")]
+    BadHeader { found: String },
+    #[error("{what} is not read, only text in three dimensions")]
+    Unsupported { what: String },
+    #[error("the header declares {declared} {what}, but {n_bytes} bytes hold at most {limit}")]
+    CountTooLarge {
+        what: &'static str,
+        declared: u64,
+        n_bytes: usize,
+        limit: u64,
+    },
+    #[error("the header declares {declared} {what}, but the file ends after {found}")]
+    Truncated {
+        what: &'static str,
+        declared: u64,
+        found: u64,
+    },
+    #[error("line {line} goes on after the {declared} faces the header declares")]
+    Trailing { line: usize, declared: u64 },
+    #[error("the OBJ reader failed: {reason}")]
+    Reader { reason: String },
+}
+
+/// What the bytes of a file in `format` hold.
+///
+/// # Errors
+/// Anything that is not a mesh with at least one face, indices in range and finite corners.
+pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
+    match format {
+        Format::Obj => obj::parse(bytes),
+        Format::Off => off::parse(bytes),
+    }
+}
+
+/// Collects polygons as fans of triangles and checks them.
+struct Polygons {
+    mesh: ParsedMesh,
+}
+
+impl Polygons {
+    fn new(vertices: Vec<[f64; 3]>) -> Self {
+        Self {
+            mesh: ParsedMesh {
+                vertices,
+                ..ParsedMesh::default()
+            },
+        }
+    }
+
+    /// Adds the next polygon of the file; its corners are indices in range, at least one.
+    fn push(&mut self, corners: &[u32]) -> Result<(), ParseError> {
+        let face = self.mesh.n_polygons;
+        if let Some(position) = corners
+            .iter()
+            .map(|&v| self.mesh.vertices[v as usize])
+            .find(|p| p.iter().any(|x| !x.is_finite()))
+        {
+            return Err(ParseError::NonFinite { face, position });
+        }
+        let last = corners.len() - 1;
+        let n_triangles = corners.len().saturating_sub(2).max(1);
+        if self.mesh.triangles.len() + n_triangles > MAX_TRIANGLES {
+            return Err(ParseError::TooManyTriangles);
+        }
+        for i in 1..=n_triangles {
+            let triangle = [corners[0], corners[i.min(last)], corners[(i + 1).min(last)]];
+            self.mesh.triangles.push(triangle);
+            self.mesh.polygon_of_triangle.push(face as u32);
+        }
+        self.mesh.n_polygons += 1;
+        Ok(())
+    }
+
+    fn finish(self) -> Result<ParsedMesh, ParseError> {
+        if self.mesh.n_polygons == 0 {
+            Err(ParseError::NoFaces)
+        } else {
+            Ok(self.mesh)
+        }
+    }
+}
+
+/// A token as it appears in a message: printable and short.
+fn shown(token: &[u8]) -> String {
+    String::from_utf8_lossy(&token[..token.len().min(40)])
+        .chars()
+        .map(|c| if c.is_control() { '\u{fffd}' } else { c })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,194 @@
+//! Object File Format: `OFF` and its variants with colours, normals and texture coordinates.
+//!
+//! One vertex and one face a line, as every writer has it: only so can the optional values behind a
+//! vertex or a face be told from what follows. Counts are checked against the bytes before anything is
+//! allocated.
+
+use super::{MAX_CORNERS, ParseError, Polygons, shown};
+use crate::mesh::ParsedMesh;
+
+/// Shortest line of a vertex, `0 0 0`, and of a face, `1 0`, with their line end.
+const MIN_VERTEX_BYTES: usize = 6;
+const MIN_FACE_BYTES: usize = 4;
+
+type Line<'a> = (usize, Vec<&'a [u8]>);
+
+/// Lines with their numbers, without comments and empty ones, split into words.
+fn lines(bytes: &[u8]) -> impl Iterator<Item = Line<'_>> {
+    bytes
+        .split(|&b| b == b'\n')
+        .enumerate()
+        .filter_map(|(i, line)| {
+            let code = line.split(|&b| b == b'#').next().unwrap_or_default();
+            let words: Vec<&[u8]> = code
+                .split(u8::is_ascii_whitespace)
+                .filter(|w| !w.is_empty())
+                .collect();
+            (!words.is_empty()).then_some((i + 1, words))
+        })
+}
+
+fn number<T: std::str::FromStr>(line: usize, token: &[u8]) -> Result<T, ParseError> {
+    std::str::from_utf8(token)
+        .ok()
+        .and_then(|t| t.parse().ok())
+        .ok_or_else(|| ParseError::NotANumber {
+            line,
+            token: shown(token),
+        })
+}
+
+/// What follows the keyword on its line: counts, or nothing. `None` when the line is no header, as in
+/// files that begin with their counts.
+fn after_keyword<'a>(words: &[&'a [u8]]) -> Result<Option<Vec<&'a [u8]>>, ParseError> {
+    let first = words[0];
+    let Some(at) = first.windows(3).position(|w| w == b"OFF") else {
+        return if first[0].is_ascii_digit() {
+            Ok(None)
+        } else {
+            Err(ParseError::BadHeader {
+                found: shown(first),
+            })
+        };
+    };
+    let prefix = &first[..at];
+    if prefix.iter().any(|b| matches!(b, b'4' | b'n')) {
+        return Err(ParseError::Unsupported {
+            what: format!("{} with other dimensions", shown(first)),
+        });
+    }
+    let rest = prefix.strip_prefix(b"ST").unwrap_or(prefix);
+    let rest = rest.strip_prefix(b"C").unwrap_or(rest);
+    let rest = rest.strip_prefix(b"N").unwrap_or(rest);
+    if !rest.is_empty() {
+        return Err(ParseError::BadHeader {
+            found: shown(first),
+        });
+    }
+    // Some writers leave out the line end: `OFF490 518 0`.
+    let glued = &first[at + 3..];
+    let mut counts = Vec::new();
+    if !glued.is_empty() {
+        counts.push(glued);
+    }
+    counts.extend_from_slice(&words[1..]);
+    if counts
+        .first()
+        .is_some_and(|w| w.eq_ignore_ascii_case(b"BINARY"))
+    {
+        return Err(ParseError::Unsupported {
+            what: "binary OFF".into(),
+        });
+    }
+    Ok(Some(counts))
+}
+
+/// The count a header declares, refused when the file is too short to hold it.
+fn count(
+    what: &'static str,
+    (line, token): (usize, &[u8]),
+    n_bytes: usize,
+    min_bytes: usize,
+) -> Result<usize, ParseError> {
+    let declared: u64 = number(line, token)?;
+    // The last line may lack its end.
+    let limit = ((n_bytes + 1) / min_bytes).min(u32::MAX as usize) as u64;
+    if declared > limit {
+        return Err(ParseError::CountTooLarge {
+            what,
+            declared,
+            n_bytes,
+            limit,
+        });
+    }
+    Ok(declared as usize)
+}
+
+pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    let mut lines = lines(bytes);
+    let Some((mut line, first)) = lines.next() else {
+        return Err(ParseError::BadHeader {
+            found: String::new(),
+        });
+    };
+    let mut counts = match after_keyword(&first)? {
+        None => first,
+        Some(counts) => counts,
+    };
+    if counts.is_empty() {
+        (line, counts) = lines.next().ok_or(ParseError::NoFaces)?;
+    }
+    let Some(&[vertices, faces]) = counts.first_chunk::<2>() else {
+        return Err(ParseError::BadHeader {
+            found: shown(counts[0]),
+        });
+    };
+    let n_vertices = count("vertices", (line, vertices), bytes.len(), MIN_VERTEX_BYTES)?;
+    let n_faces = count("faces", (line, faces), bytes.len(), MIN_FACE_BYTES)?;
+
+    let mut positions = Vec::with_capacity(n_vertices);
+    while positions.len() < n_vertices {
+        let (line, words) = lines.next().ok_or(ParseError::Truncated {
+            what: "vertices",
+            declared: n_vertices as u64,
+            found: positions.len() as u64,
+        })?;
+        let Some(&[x, y, z]) = words.first_chunk::<3>() else {
+            return Err(ParseError::ShortVertex {
+                line,
+                found: words.len(),
+            });
+        };
+        positions.push([number(line, x)?, number(line, y)?, number(line, z)?]);
+    }
+
+    let mut polygons = Polygons::new(positions);
+    let mut corners = Vec::new();
+    for face in 0..n_faces {
+        let (line, words) = lines.next().ok_or(ParseError::Truncated {
+            what: "faces",
+            declared: n_faces as u64,
+            found: face as u64,
+        })?;
+        let declared: u64 = number(line, words[0])?;
+        if declared == 0 {
+            return Err(ParseError::EmptyFace { line, face });
+        }
+        if declared > MAX_CORNERS as u64 {
+            return Err(ParseError::PolygonTooLarge {
+                face,
+                corners: declared,
+            });
+        }
+        let found = words.len() - 1;
+        if (found as u64) < declared {
+            return Err(ParseError::ShortFace {
+                line,
+                face,
+                found,
+                declared,
+            });
+        }
+        corners.clear();
+        for token in &words[1..=declared as usize] {
+            let vertex: i64 = number(line, token)?;
+            if vertex < 0 || vertex >= n_vertices as i64 {
+                return Err(ParseError::VertexOutOfRange {
+                    face,
+                    vertex,
+                    n_vertices,
+                });
+            }
+            corners.push(vertex as u32);
+        }
+        polygons.push(&corners)?;
+    }
+    if let Some((line, _)) = lines.next() {
+        return Err(ParseError::Trailing {
+            line,
+            declared: n_faces as u64,
+        });
+    }
+    polygons.finish()
+}

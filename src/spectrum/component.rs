@@ -1,0 +1,276 @@
+//! A stiffness and a mass become connected components, each in standard form.
+
+use super::SpectrumError;
+use crate::linalg::ldlt::{Analysis, Factor, LdltError, SymmetricSparse};
+use crate::linalg::panel::{Row, WIDTH};
+
+/// A row sum of W below this share of the row's absolute sum is rounding of an exact zero.
+const ROW_SUM_ROUNDING: f64 = 1e-13;
+
+/// Stored entries of W that differ from their mirror image by more than this share of the larger
+/// diagonal entry are an error of the caller.
+const ASYMMETRY: f64 = 1e-10;
+
+/// A shift that hits a pivot exactly is moved by this share.
+const NUDGE: f64 = 1e-9;
+
+/// One connected component of W, in elimination order: `S = A^{-1/2} W A^{-1/2}`.
+pub(super) struct Component {
+    /// The vertex of each row.
+    pub(super) vertices: Vec<u32>,
+    /// W in input units.
+    pub(super) stiffness: SymmetricSparse,
+    /// S.
+    pub(super) standard: SymmetricSparse,
+    /// `1 / √a`.
+    pub(super) inverse_sqrt_mass: Vec<f64>,
+    /// Row sums of W; exactly zero where they are rounding.
+    row_sums: Vec<f64>,
+    /// `Σ a`.
+    pub(super) area: f64,
+    /// Whether the constant function is in the null space of W.
+    pub(super) has_null_vector: bool,
+    pub(super) analysis: Analysis,
+}
+
+impl Component {
+    /// Rows.
+    pub(super) fn n(&self) -> usize {
+        self.vertices.len()
+    }
+
+    /// The unit null vector of S, by row.
+    pub(super) fn null_vector(&self) -> impl Iterator<Item = f64> + '_ {
+        let scale = self.area.sqrt();
+        self.inverse_sqrt_mass
+            .iter()
+            .map(move |x| 1.0 / (x * scale))
+    }
+
+    /// Factorises `S - shift I`; moves the shift up a little where it hits a pivot exactly.
+    pub(super) fn factor(&self, shift: f64) -> Result<(Factor, f64), LdltError> {
+        let mut moved = shift;
+        for attempt in 1..=8 {
+            match Factor::new(&self.analysis, &self.standard, moved) {
+                Err(LdltError::ZeroPivot { .. }) if attempt < 8 => {
+                    moved = shift + f64::from(attempt) * NUDGE * shift.abs();
+                }
+                other => return other.map(|factor| (factor, moved)),
+            }
+        }
+        unreachable!("the last attempt returns")
+    }
+
+    /// Rayleigh quotients λ and residuals `‖S x - λ x‖` of 16 unit vectors. W is applied to
+    /// differences along edges, so that large weights of sliver triangles do not amplify the
+    /// rounding of a sum that cancels.
+    pub(super) fn rayleigh(&self, x: &[Row]) -> ([f64; WIDTH], [f64; WIDTH]) {
+        let phi: Vec<Row> = x
+            .iter()
+            .zip(&self.inverse_sqrt_mass)
+            .map(|(row, s)| Row(row.0.map(|v| v * s)))
+            .collect();
+        let mut quotients = [0.0; WIDTH];
+        let mut images = Vec::with_capacity(self.n());
+        for (i, (&scale, &row_sum)) in self
+            .inverse_sqrt_mass
+            .iter()
+            .zip(&self.row_sums)
+            .enumerate()
+        {
+            let (columns, values) = self.stiffness.row(i);
+            let own = phi[i].0;
+            let mut image = own.map(|v| v * row_sum);
+            for (&c, &w) in columns.iter().zip(values) {
+                for ((a, o), p) in image.iter_mut().zip(&own).zip(&phi[c as usize].0) {
+                    *a += w * (p - o);
+                }
+            }
+            for ((q, a), v) in quotients.iter_mut().zip(&mut image).zip(&x[i].0) {
+                *a *= scale;
+                *q += *a * v;
+            }
+            images.push(Row(image));
+        }
+        let mut sums = [0.0; WIDTH];
+        for (image, v) in images.iter().zip(x) {
+            for (((s, a), v), l) in sums.iter_mut().zip(&image.0).zip(&v.0).zip(&quotients) {
+                let r = a - l * v;
+                *s += r * r;
+            }
+        }
+        (quotients, sums.map(f64::sqrt))
+    }
+}
+
+/// Checks both matrices.
+pub(super) fn validate(stiffness: &sprs::CsMat<f64>, mass: &[f64]) -> Result<(), SpectrumError> {
+    let (rows, columns) = stiffness.shape();
+    if rows != columns {
+        return Err(SpectrumError::NotSquare { rows, columns });
+    }
+    if mass.len() != rows {
+        return Err(SpectrumError::MassLength {
+            n_mass: mass.len(),
+            n: rows,
+        });
+    }
+    if let Some((vertex, &value)) = mass
+        .iter()
+        .enumerate()
+        .find(|(_, m)| !m.is_normal() || **m < 0.0)
+    {
+        return Err(SpectrumError::Mass { vertex, value });
+    }
+    let diagonal: Vec<f64> = (0..rows)
+        .map(|i| stiffness.get(i, i).copied().unwrap_or(0.0).abs())
+        .collect();
+    for (outer, vector) in stiffness.outer_iterator().enumerate() {
+        for (inner, &value) in vector.iter() {
+            if !value.is_finite() {
+                return Err(SpectrumError::Stiffness {
+                    row: outer,
+                    column: inner,
+                    value,
+                });
+            }
+            if inner > outer {
+                continue;
+            }
+            let mirror = stiffness
+                .get_outer_inner(inner, outer)
+                .copied()
+                .unwrap_or(0.0);
+            if (value - mirror).abs() > ASYMMETRY * diagonal[outer].max(diagonal[inner]) {
+                return Err(SpectrumError::NotSymmetric {
+                    row: outer,
+                    column: inner,
+                    value,
+                    mirror,
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Splits W into its connected components, in the order of their first vertices.
+pub(super) fn components(
+    stiffness: &sprs::CsMat<f64>,
+    mass: &[f64],
+) -> Result<Vec<Component>, SpectrumError> {
+    let n = mass.len();
+    const UNSEEN: u32 = u32::MAX;
+    let mut component_of = vec![UNSEEN; n];
+    let mut members: Vec<Vec<u32>> = Vec::new();
+    let mut stack = Vec::new();
+    for first in 0..n {
+        if component_of[first] != UNSEEN {
+            continue;
+        }
+        let id = members.len() as u32;
+        let mut vertices = Vec::new();
+        component_of[first] = id;
+        stack.push(first);
+        while let Some(v) = stack.pop() {
+            vertices.push(v as u32);
+            let row = stiffness
+                .outer_view(v)
+                .expect("invariant: v is below the size of W");
+            for (u, &w) in row.iter() {
+                if w != 0.0 && component_of[u] == UNSEEN {
+                    component_of[u] = id;
+                    stack.push(u);
+                }
+            }
+        }
+        vertices.sort_unstable();
+        members.push(vertices);
+    }
+    let mut local = vec![0u32; n];
+    members
+        .iter()
+        .map(|vertices| {
+            for (i, &v) in vertices.iter().enumerate() {
+                local[v as usize] = i as u32;
+            }
+            component(stiffness, mass, vertices, &local)
+        })
+        .collect()
+}
+
+fn component(
+    stiffness: &sprs::CsMat<f64>,
+    mass: &[f64],
+    vertices: &[u32],
+    local: &[u32],
+) -> Result<Component, SpectrumError> {
+    let mut w = SymmetricSparse {
+        row_starts: vec![0],
+        columns: Vec::new(),
+        values: Vec::new(),
+    };
+    for (i, &v) in vertices.iter().enumerate() {
+        let row = stiffness
+            .outer_view(v as usize)
+            .expect("invariant: v is below the size of W");
+        let mut diagonal_seen = false;
+        for (u, &value) in row.iter() {
+            if value == 0.0 && u != v as usize {
+                continue;
+            }
+            let column = local[u];
+            if !diagonal_seen && column as usize > i {
+                w.columns.push(i as u32);
+                w.values.push(0.0);
+                diagonal_seen = true;
+            }
+            diagonal_seen |= column as usize == i;
+            w.columns.push(column);
+            w.values.push(value);
+        }
+        if !diagonal_seen {
+            w.columns.push(i as u32);
+            w.values.push(0.0);
+        }
+        w.row_starts.push(w.columns.len());
+    }
+    let analysis = Analysis::new(&w)?;
+    let stiffness = w.permuted(&analysis.order);
+    let vertices: Vec<u32> = analysis
+        .order
+        .iter()
+        .map(|&i| vertices[i as usize])
+        .collect();
+    let inverse_sqrt_mass: Vec<f64> = vertices
+        .iter()
+        .map(|&v| 1.0 / mass[v as usize].sqrt())
+        .collect();
+    let mut standard = stiffness.clone();
+    let mut row_sums = Vec::with_capacity(vertices.len());
+    for i in 0..vertices.len() {
+        let range = stiffness.row_starts[i]..stiffness.row_starts[i + 1];
+        for p in range.clone() {
+            let j = stiffness.columns[p] as usize;
+            standard.values[p] *= inverse_sqrt_mass[i] * inverse_sqrt_mass[j];
+        }
+        let (_, values) = stiffness.row(i);
+        let sum: f64 = values.iter().sum();
+        let absolute: f64 = values.iter().map(|x| x.abs()).sum();
+        row_sums.push(if sum.abs() <= ROW_SUM_ROUNDING * absolute {
+            0.0
+        } else {
+            sum
+        });
+    }
+    Ok(Component {
+        area: vertices.iter().map(|&v| mass[v as usize]).sum(),
+        has_null_vector: row_sums.iter().all(|&s| s == 0.0),
+        vertices,
+        stiffness,
+        standard,
+        inverse_sqrt_mass,
+        row_sums,
+        analysis,
+    })
+}

@@ -1,0 +1,135 @@
+//! One connected component becomes its smallest eigenpairs, proved complete: densely if it is small
+//! or most of its spectrum is wanted.
+
+use super::component::Component;
+use super::iterative::{Lanczos, first_dimension};
+use super::polish::verify_and_polish;
+use super::{Hook, SpectrumError};
+use crate::linalg::dense_eigen::symmetric_eigen;
+use crate::linalg::panel::{Row, WIDTH, zero_panel};
+
+/// Components up to this size are solved densely.
+const DENSE_ALWAYS: usize = 160;
+
+/// Dense eigenvalues below minus this share of the largest are not rounding.
+const NEGATIVE: f64 = 1e-10;
+
+/// Eigenpairs of a component: all that lie below `limit`.
+pub(super) struct Pairs {
+    /// Ascending.
+    pub(super) values: Vec<f64>,
+    /// `‖S x - λ x‖` of each.
+    pub(super) residuals: Vec<f64>,
+    /// Orthonormal eigenvectors of S, 16 a panel, rows in elimination order.
+    pub(super) panels: Vec<Vec<Row>>,
+    /// Every eigenvalue below this is among `values`.
+    pub(super) limit: f64,
+    /// Distance from `limit` to the nearest eigenvalue found.
+    pub(super) margin: f64,
+    /// Bound on the perturbation of S under which the count at `limit` is exact.
+    pub(super) perturbation: f64,
+    /// Dimension of the Krylov space; 0 for a dense solve.
+    pub(super) n_krylov: usize,
+    /// Rounds of inverse iteration and of looking for missing pairs.
+    pub(super) n_polish: usize,
+    pub(super) n_repair: usize,
+}
+
+/// What a solve needs besides the matrix.
+pub(super) struct Setting<'a> {
+    pub(super) tolerance: f64,
+    pub(super) seed: u64,
+    pub(super) parallel: bool,
+    pub(super) hook: Hook<'a>,
+}
+
+/// At least `k` smallest eigenpairs (1 ≤ k ≤ n), all of them below `limit`.
+pub(super) fn smallest(
+    component: &Component,
+    k: usize,
+    setting: &Setting,
+) -> Result<Pairs, SpectrumError> {
+    let n = component.n();
+    let krylov = first_dimension(k, n);
+    if n <= DENSE_ALWAYS || krylov + 4 * WIDTH > n * 3 / 4 {
+        return dense(component, k, setting);
+    }
+    Lanczos { component, setting }.run(k)
+}
+
+/// Where to put the limit above pair `j` when `values` are ascending: the first gap at or after k
+/// that is not the inside of a cluster. Returns (number of pairs below, limit, margin).
+pub(super) fn gap_after(values: &[f64], k: usize, n: usize) -> Option<(usize, f64, f64)> {
+    for j in k..=values.len() {
+        if j == n {
+            return Some((n, f64::INFINITY, f64::INFINITY));
+        }
+        if j < values.len() {
+            let gap = values[j] - values[j - 1];
+            let mean_spacing = values[j] / (j + 1) as f64;
+            if gap > 0.02 * mean_spacing {
+                let margin = 0.3 * gap.min(mean_spacing);
+                return Some((j, values[j - 1] + margin, margin));
+            }
+        }
+    }
+    None
+}
+
+pub(super) fn dense(
+    component: &Component,
+    k: usize,
+    setting: &Setting,
+) -> Result<Pairs, SpectrumError> {
+    setting.hook.enter("dense")?;
+    let n = component.n();
+    let mut a = vec![0.0; n * n];
+    for i in 0..n {
+        let (columns, values) = component.standard.row(i);
+        for (&c, &x) in columns.iter().zip(values) {
+            a[i * n + c as usize] = x;
+        }
+    }
+    let (mut values, vectors) = symmetric_eigen(&a, n)?;
+    let largest = values[n - 1].abs().max(values[0].abs());
+    let count = values.iter().filter(|l| **l < -NEGATIVE * largest).count();
+    if count > 0 {
+        return Err(SpectrumError::NotSemidefinite {
+            count,
+            below: -NEGATIVE * largest,
+        });
+    }
+    if component.has_null_vector {
+        values[0] = 0.0;
+    }
+    let (j, limit, margin) = gap_after(&values, k, n).unwrap_or((n, f64::INFINITY, f64::INFINITY));
+    let mut panels = Vec::with_capacity(j.div_ceil(WIDTH));
+    for first in (0..j).step_by(WIDTH) {
+        let mut panel = zero_panel(n);
+        for column in first..(first + WIDTH).min(j) {
+            for (i, row) in panel[..n].iter_mut().enumerate() {
+                row.0[column - first] = vectors[(i, column)];
+            }
+        }
+        panels.push(panel);
+    }
+    if component.has_null_vector {
+        for (row, x) in panels[0].iter_mut().zip(component.null_vector()) {
+            row.0[0] = x;
+        }
+    }
+    values.truncate(j);
+    let mut pairs = Pairs {
+        values,
+        residuals: Vec::new(),
+        panels,
+        limit,
+        margin,
+        perturbation: n as f64 * f64::EPSILON * largest,
+        n_krylov: 0,
+        n_polish: 0,
+        n_repair: 0,
+    };
+    verify_and_polish(component, setting, &mut pairs)?;
+    Ok(pairs)
+}

@@ -1,0 +1,267 @@
+//! What exists: collections, shapes, labels, maps, jobs, requests and events, in one SQLite file.
+//!
+//! One connection writes, behind a lock; a write is one transaction and durable when it returns
+//! (`synchronous=FULL`). Readers have connections of their own and see the last commit as of the
+//! moment they began; with the write-ahead log they never wait for the writer, nor it for them.
+
+mod collections;
+mod jobs;
+mod labels;
+mod maps;
+mod reader;
+pub(crate) mod schema;
+mod shapes;
+
+pub use labels::KEPT_LABEL_VERSIONS;
+pub use reader::{Reader, Tx};
+pub use schema::CATALOG_FORMAT;
+
+use super::error::CATALOG_FILE;
+use super::{Health, StoreError};
+use rusqlite::{Connection, OpenFlags, TransactionBehavior, ffi};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+/// Other processes hold the file's lock only for moments (a backup, `sqlite3`).
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Connections that are kept for the next reader; a burst opens more and closes them again.
+const KEPT_READERS: usize = 4;
+
+/// The write-ahead log is copied into the file whenever it has grown by this much.
+const CHECKPOINT_BYTES: u64 = 4 << 20;
+
+/// The catalog of one library.
+#[derive(Debug)]
+pub struct Catalog {
+    path: PathBuf,
+    health: Health,
+    writer: Mutex<Writer>,
+    readers: Mutex<Vec<Connection>>,
+}
+
+#[derive(Debug)]
+struct Writer {
+    connection: Connection,
+    /// Length of the write-ahead log at which the next checkpoint is due.
+    checkpoint_at: u64,
+}
+
+impl Catalog {
+    /// Opens the catalog at `path`, which is created if it is missing. The caller holds the
+    /// library's lock.
+    pub fn open(path: &Path, health: Health) -> Result<Self, StoreError> {
+        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
+            | OpenFlags::SQLITE_OPEN_CREATE
+            | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let mut connection = Connection::open_with_flags(path, flags)?;
+        schema::register_row_sum(&connection)?;
+        connection.busy_timeout(BUSY_TIMEOUT)?;
+        connection.pragma_update(None, "foreign_keys", true)?;
+        schema::prepare(&mut connection, &path.display().to_string())?;
+        let mode: String =
+            connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
+        if mode != "wal" {
+            return Err(StoreError::Damaged {
+                path: path.display().to_string(),
+                message: format!("its file system allows journal mode {mode:?} only, not \"wal\""),
+            });
+        }
+        connection.pragma_update(None, "synchronous", "FULL")?;
+        // With neither spills nor automatic checkpoints, all syncs happen in COMMIT and in
+        // `checkpoint`, where their failures are seen.
+        connection.pragma_update(None, "cache_spill", false)?;
+        connection.pragma_update(None, "wal_autocheckpoint", 0)?;
+        connection.set_prepared_statement_cache_capacity(128);
+        let writer = Writer {
+            connection,
+            checkpoint_at: CHECKPOINT_BYTES,
+        };
+        let path = path.to_path_buf();
+        Ok(Self {
+            path,
+            health,
+            writer: Mutex::new(writer),
+            readers: Mutex::new(Vec::new()),
+        })
+    }
+
+    /// Runs `change` in a transaction, which is durable when this returns `Ok`, and leaves no trace
+    /// otherwise.
+    pub fn write<T, E: From<StoreError>>(
+        &self,
+        change: impl FnOnce(&Tx<'_>) -> Result<T, E>,
+    ) -> Result<T, E> {
+        self.health.writable()?;
+        let mut writer = self.writer();
+        let transaction = writer
+            .connection
+            .transaction_with_behavior(TransactionBehavior::Immediate)
+            .map_err(|e| self.failed(e))?;
+        let value = change(&Tx::new(&transaction))?;
+        transaction.commit().map_err(|e| self.failed(e))?;
+        // The change is durable, whatever becomes of the checkpoint: a failed sync stops the
+        // writes that come after it.
+        if let Err(error) = self.checkpoint_if_due(&mut writer) {
+            tracing::error!(%error, "the catalog's log could not be checkpointed");
+        }
+        Ok(value)
+    }
+
+    /// Runs `view` on the catalog as it stands now; later commits are not seen.
+    pub fn read<T, E: From<StoreError>>(
+        &self,
+        view: impl FnOnce(&Reader<'_>) -> Result<T, E>,
+    ) -> Result<T, E> {
+        let pooled = self.readers().pop();
+        let mut connection = match pooled {
+            Some(connection) => connection,
+            None => open_reader(&self.path)?,
+        };
+        let value = {
+            let transaction = connection.transaction().map_err(StoreError::from)?;
+            view(&Reader::new(&transaction))
+        };
+        let mut readers = self.readers();
+        if readers.len() < KEPT_READERS {
+            readers.push(connection);
+        }
+        value
+    }
+
+    /// Copies the write-ahead log into the file as far as readers allow.
+    fn checkpoint_if_due(&self, writer: &mut Writer) -> Result<(), StoreError> {
+        let mut log = self.path.clone().into_os_string();
+        log.push("-wal");
+        let length = std::fs::metadata(&log).map_or(0, |metadata| metadata.len());
+        if length < writer.checkpoint_at {
+            return Ok(());
+        }
+        // Not waiting for readers: what they still need is copied the next time.
+        writer.connection.busy_timeout(Duration::ZERO)?;
+        let copied = writer
+            .connection
+            .query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |row| {
+                row.get::<_, i64>(0)
+            })
+            .map_err(|e| self.failed(e));
+        writer.connection.busy_timeout(BUSY_TIMEOUT)?;
+        writer.checkpoint_at = if copied? == 0 { 0 } else { length } + CHECKPOINT_BYTES;
+        Ok(())
+    }
+
+    /// The error for a statement that syncs; a failed sync stops all writes.
+    fn failed(&self, error: rusqlite::Error) -> StoreError {
+        match error.sqlite_error().map(|e| e.extended_code) {
+            Some(ffi::SQLITE_IOERR_FSYNC | ffi::SQLITE_IOERR_DIR_FSYNC) => self
+                .health
+                .stop(format!("fsync {}: {error}", self.path.display())),
+            _ => error.into(),
+        }
+    }
+
+    fn writer(&self) -> MutexGuard<'_, Writer> {
+        // A panic in a change has rolled its transaction back.
+        self.writer.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn readers(&self) -> MutexGuard<'_, Vec<Connection>> {
+        self.readers.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Opens a catalog for reading only, beside a process that may be writing it.
+pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(path, flags)?;
+    schema::register_row_sum(&connection)?;
+    connection.busy_timeout(BUSY_TIMEOUT)?;
+    connection.set_prepared_statement_cache_capacity(64);
+    schema::check_format(&connection, &path.display().to_string())?;
+    Ok(connection)
+}
+
+/// The catalog's path in a library folder.
+pub(super) fn path_in(library: &Path) -> PathBuf {
+    library.join(CATALOG_FILE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::rows::{CollectionId, NewCollection};
+
+    fn opened() -> (tempfile::TempDir, Catalog, CollectionId) {
+        let dir = tempfile::tempdir().expect("a folder");
+        let catalog = Catalog::open(&path_in(dir.path()), Health::default()).expect("opens");
+        let new = NewCollection { name: "a".into(), ..NewCollection::default() };
+        let id = catalog.write(|tx| tx.insert_collection(&new)).expect("inserted");
+        (dir, catalog, id)
+    }
+
+    fn state(catalog: &Catalog, id: CollectionId) -> Vec<u8> {
+        let row = catalog.read(|r| r.collection_by_id(id)).expect("readable");
+        row.expect("there").state
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_that_passes() {
+        let (_dir, catalog, id) = opened();
+        let limit = |pages: u32| {
+            let writer = catalog.writer();
+            let set = |row: &rusqlite::Row<'_>| row.get::<_, u32>(0);
+            writer
+                .connection
+                .pragma_update_and_check(None, "max_page_count", pages, set)
+                .expect("set");
+        };
+        limit(1);
+        let big = vec![1; 1 << 20];
+        let full = catalog.write(|tx| tx.set_state(id, &big));
+        assert!(matches!(full, Err(StoreError::NoSpace { .. })), "{full:?}");
+        assert_eq!(state(&catalog, id), b"");
+        limit(1 << 20);
+        catalog.write(|tx| tx.set_state(id, &big)).expect("there is space again");
+        assert_eq!(state(&catalog, id), big);
+    }
+
+    #[test]
+    fn a_failed_sync_ends_writing_and_not_reading() {
+        let (_dir, catalog, id) = opened();
+        let error = ffi::Error {
+            code: rusqlite::ErrorCode::SystemIoFailure,
+            extended_code: ffi::SQLITE_IOERR_FSYNC,
+        };
+        let failed = catalog.failed(rusqlite::Error::SqliteFailure(error, None));
+        assert!(matches!(failed, StoreError::ReadOnly { .. }), "{failed}");
+        let refused = catalog.write(|tx| tx.set_state(id, b"x"));
+        assert!(matches!(refused, Err(StoreError::ReadOnly { .. })), "{refused:?}");
+        assert_eq!(state(&catalog, id), b"");
+    }
+
+    #[test]
+    fn the_log_stays_bounded_even_beside_a_reader() {
+        let (_dir, catalog, id) = opened();
+        let log = catalog.path.with_file_name("catalog.db-wal");
+        let write = || {
+            for i in 0..40_u8 {
+                catalog.write(|tx| tx.set_state(id, &vec![i; 1 << 18])).expect("written");
+            }
+        };
+        let length = || std::fs::metadata(&log).expect("there").len();
+        write();
+        assert!(length() <= CHECKPOINT_BYTES + (1 << 19), "{}", length());
+        // Beside a reader that keeps the log from being emptied, commits go on.
+        let seen = catalog.read(|r| {
+            let before = r.collection_by_id(id)?.expect("there").state;
+            write();
+            assert_eq!(r.collection_by_id(id)?.expect("there").state, before);
+            Ok::<_, StoreError>(before)
+        });
+        assert_eq!(seen.expect("readable"), vec![39; 1 << 18]);
+        write();
+        write();
+        assert!(length() <= 16 << 20, "{}", length());
+    }
+}

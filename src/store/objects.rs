@@ -1,0 +1,431 @@
+//! Immutable, content-addressed files: the array file of each description and the original bytes.
+//!
+//! A file is written under `tmp/`, synced, renamed to its place and its folder is synced; only then
+//! does the caller write the catalog row that names it, with length and digest. That row is the only
+//! commit marker: a file without one does not count and is swept after a day. A file in its place is
+//! complete and never changes; where other bytes turn out to be needed under a name that is taken,
+//! they get a name of their own beside it, so that a row never speaks of bytes that were replaced.
+
+use super::codec::decompress;
+use super::disk::Disk;
+use super::error::is_no_space;
+use super::mapped::{ArrayFileError, MappedDescription, write_description};
+use super::rows::{ObjectKind, ObjectRow};
+use super::{Digest, Health, StoreError};
+use crate::pipeline::Description;
+use std::collections::{HashMap, HashSet};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Bytes of array files that stay mapped between uses, unless told otherwise.
+pub const DEFAULT_CACHE_BYTES: usize = 32 << 20;
+
+/// Orphans younger than this may belong to work that is under way.
+pub const ORPHAN_AGE: Duration = Duration::from_secs(24 * 60 * 60);
+
+/// Of the levels below 7 the one beyond which OBJ text hardly shrinks further.
+const ZSTD_LEVEL: i32 = 3;
+
+const TEMPORARY: &str = "tmp";
+
+/// The folders that hold object files, or what is to become one.
+pub(super) const FOLDERS: [&str; 3] = ["objects", "originals", TEMPORARY];
+
+/// The object files of one library.
+pub struct Objects {
+    disk: Arc<dyn Disk>,
+    root: PathBuf,
+    health: Health,
+    /// One file is published at a time, so that nobody finds a name that may yet be taken back.
+    publishing: Mutex<()>,
+    state: Mutex<State>,
+}
+
+struct State {
+    /// Files that something in this process may be about to name in the catalog, or to open, and
+    /// since when. The monotonic clock decides, so that a jump of the wall clock sweeps nothing.
+    held: HashMap<String, Instant>,
+    /// Folders whose own names are durable.
+    durable_folders: HashSet<String>,
+    n_temporary: u64,
+    /// Opened files, most recently used last.
+    cache: Vec<(String, Digest, MappedDescription)>,
+    cache_bytes: usize,
+}
+
+impl ObjectKind {
+    fn folder(self) -> &'static str {
+        match self {
+            Self::Description => "objects",
+            Self::Original => "originals",
+        }
+    }
+
+    fn extension(self) -> &'static str {
+        match self {
+            Self::Description => "safetensors",
+            Self::Original => "zst",
+        }
+    }
+}
+
+impl Objects {
+    /// Opens the files below `root`, which must exist; its folders are created.
+    pub fn open(disk: Arc<dyn Disk>, root: &Path, health: Health) -> Result<Self, StoreError> {
+        let objects = Self {
+            disk,
+            root: root.to_path_buf(),
+            health,
+            publishing: Mutex::new(()),
+            state: Mutex::new(State {
+                held: HashMap::new(),
+                durable_folders: HashSet::new(),
+                n_temporary: 0,
+                cache: Vec::new(),
+                cache_bytes: DEFAULT_CACHE_BYTES,
+            }),
+        };
+        for folder in FOLDERS {
+            let path = root.join(folder);
+            objects
+                .disk
+                .create_dir(&path)
+                .map_err(|e| StoreError::io(&path, e))?;
+        }
+        objects
+            .disk
+            .sync_dir(root)
+            .map_err(|e| objects.sync_failed(root, &e))?;
+        Ok(objects)
+    }
+
+    /// Stores a description under its digest (see [`Digest::of_description`]) and returns the row
+    /// that makes it count, for the caller to commit.
+    pub fn put_description(
+        &self,
+        digest: Digest,
+        description: &Description,
+        params_json: &str,
+    ) -> Result<ObjectRow, StoreError> {
+        let bytes = write_description(description, params_json)?;
+        self.put(ObjectKind::Description, digest, &bytes, |stored| {
+            stored == bytes
+        })
+    }
+
+    /// Stores the bytes of a mesh file, compressed, and returns the row that makes them count.
+    pub fn put_original(&self, bytes: &[u8]) -> Result<ObjectRow, StoreError> {
+        let digest = Digest::of(bytes);
+        let path = self.root.join(ObjectKind::Original.folder());
+        let compressed =
+            zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|e| StoreError::io(&path, e))?;
+        self.put(ObjectKind::Original, digest, &compressed, |stored| {
+            decompress(stored, bytes.len()).is_ok_and(|stored| stored == bytes)
+        })
+    }
+
+    /// The description a row names: mapped, its length and BLAKE3 checked once per opening.
+    pub fn open_description(&self, row: &ObjectRow) -> Result<MappedDescription, StoreError> {
+        if let Some(mapped) = self.cached(&row.file, row.blake3) {
+            return Ok(mapped);
+        }
+        let mapped = map_description(&self.root, row)?;
+        let mut state = self.state();
+        state
+            .cache
+            .push((row.file.clone(), row.blake3, mapped.clone()));
+        state.trim_cache();
+        Ok(mapped)
+    }
+
+    /// The bytes a row names, as they were put.
+    pub fn original(&self, row: &ObjectRow) -> Result<Vec<u8>, StoreError> {
+        read_original(&*self.disk, &self.root, row)
+    }
+
+    /// Bounds the bytes that stay mapped between uses; 0 keeps nothing mapped.
+    pub fn set_cache_bytes(&self, bytes: usize) {
+        let mut state = self.state();
+        state.cache_bytes = bytes;
+        state.trim_cache();
+    }
+
+    /// Keeps files, named relative to the library, from being swept for a day.
+    pub(super) fn hold(&self, files: impl IntoIterator<Item = String>) {
+        let now = Instant::now();
+        self.state()
+            .held
+            .extend(files.into_iter().map(|file| (file, now)));
+    }
+
+    /// Removes files that are neither catalogued nor younger than `min_age`, and returns their
+    /// names. What this process wrote or let go is aged by the monotonic clock.
+    pub(super) fn sweep(
+        &self,
+        min_age: Duration,
+        catalogued: impl Fn(&str) -> Result<bool, StoreError>,
+    ) -> Result<Vec<String>, StoreError> {
+        self.health.writable()?;
+        self.state()
+            .held
+            .retain(|_, since| since.elapsed() < min_age);
+        let mut swept = Vec::new();
+        for folder in FOLDERS {
+            let path = self.root.join(folder);
+            for entry in self
+                .disk
+                .files(&path)
+                .map_err(|e| StoreError::io(&path, e))?
+            {
+                let file = relative(&self.root, &entry.path);
+                // A time in the future is no age at all.
+                let old = entry.modified.elapsed().is_ok_and(|age| age >= min_age);
+                if !old || catalogued(&file)? {
+                    continue;
+                }
+                // Held until the file is gone: a put of the same name announces itself first.
+                let state = self.state();
+                if state.held.contains_key(&file) {
+                    continue;
+                }
+                self.disk
+                    .remove(&entry.path)
+                    .map_err(|e| StoreError::io(&entry.path, e))?;
+                swept.push(file);
+            }
+        }
+        Ok(swept)
+    }
+
+    fn put(
+        &self,
+        kind: ObjectKind,
+        digest: Digest,
+        bytes: &[u8],
+        same: impl Fn(&[u8]) -> bool,
+    ) -> Result<ObjectRow, StoreError> {
+        self.health.writable()?;
+        let hex = digest.to_string();
+        let folder = format!("{}/{}", kind.folder(), &hex[..2]);
+        let _publishing = self.publishing.lock().unwrap_or_else(PoisonError::into_inner);
+        self.make_folder(kind.folder(), &folder)?;
+
+        let blake3 = Digest::of(bytes);
+        let beside = &blake3.to_string()[..16];
+        let names = [hex.clone(), format!("{hex}-{beside}")];
+        for name in names {
+            let file = format!("{folder}/{name}.{}", kind.extension());
+            self.hold([file.clone()]);
+            let path = self.root.join(&file);
+            match self.disk.read(&path) {
+                // Durable: it was synced before it got this name, and the name was there when
+                // `make_folder` synced the folder, or was published since.
+                Ok(stored) if same(&stored) => {
+                    let (length, blake3) = (stored.len() as u64, Digest::of(&stored));
+                    return Ok(ObjectRow {
+                        kind,
+                        digest,
+                        file,
+                        length,
+                        blake3,
+                    });
+                }
+                // Other bytes: either damaged, or written by another version and named by a row.
+                Ok(_) => continue,
+                Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+                Err(e) => return Err(StoreError::io(&path, e)),
+            }
+            self.publish(&self.root.join(&folder), &path, bytes)?;
+            return Ok(ObjectRow {
+                kind,
+                digest,
+                file,
+                length: bytes.len() as u64,
+                blake3,
+            });
+        }
+        Err(damaged(
+            &format!("{folder}/{hex}"),
+            "both files of this name hold other bytes",
+        ))
+    }
+
+    /// Makes the folder of a two-digit prefix. Once per process both its own name and the names in
+    /// it are synced: an earlier process may have ended between a rename and its sync.
+    fn make_folder(&self, parent: &str, folder: &str) -> Result<(), StoreError> {
+        if self.state().durable_folders.contains(folder) {
+            return Ok(());
+        }
+        let path = self.root.join(folder);
+        let created = self.disk.create_dir(&path).map_err(|e| StoreError::io(&path, e))?;
+        let parent = self.root.join(parent);
+        let synced = self.disk.sync_dir(&parent).and_then(|()| match created {
+            true => Ok(()),
+            false => self.disk.sync_dir(&path),
+        });
+        if let Err(e) = synced {
+            // Once the folder is gone again, the next attempt starts from the beginning; a folder
+            // that was there before cannot be taken back.
+            return Err(if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
+                StoreError::io(&parent, e)
+            } else {
+                self.health.stop(format!("fsync {}: {e}", path.display()))
+            });
+        }
+        self.state().durable_folders.insert(folder.to_string());
+        Ok(())
+    }
+
+    /// Temporary file, sync, rename, sync of the folder.
+    fn publish(&self, folder: &Path, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+        let (temporary, name) = self.temporary();
+        let written = self.write_synced(&temporary, bytes).and_then(|()| {
+            self.disk
+                .rename(&temporary, path)
+                .map_err(|e| StoreError::io(path, e))
+        });
+        self.state().held.remove(&name);
+        if let Err(error) = written {
+            // If this fails too, the sweep finds the file.
+            let _ = self.disk.remove(&temporary);
+            return Err(error);
+        }
+        match self.disk.sync_dir(folder) {
+            Ok(()) => Ok(()),
+            // Taken back, so that no later call finds a name whose sync failed.
+            Err(e) if is_no_space(&e) && self.disk.remove(path).is_ok() => {
+                Err(StoreError::io(folder, e))
+            }
+            Err(e) => Err(self.health.stop(format!("fsync {}: {e}", folder.display()))),
+        }
+    }
+
+    fn write_synced(&self, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+        let mut file = self
+            .disk
+            .create(path)
+            .map_err(|e| StoreError::io(path, e))?;
+        file.write_all(bytes).map_err(|e| StoreError::io(path, e))?;
+        file.sync().map_err(|e| self.sync_failed(path, &e))
+    }
+
+    /// A full disk passes: the file is thrown away, and the next attempt writes a new one. Any
+    /// other failed sync is the end of writing.
+    fn sync_failed(&self, path: &Path, error: &io::Error) -> StoreError {
+        let path = path.display().to_string();
+        if is_no_space(error) {
+            StoreError::NoSpace { path }
+        } else {
+            self.health.stop(format!("fsync {path}: {error}"))
+        }
+    }
+
+    /// A path for a new temporary file, held; and its name relative to the library.
+    fn temporary(&self) -> (PathBuf, String) {
+        loop {
+            let mut state = self.state();
+            state.n_temporary += 1;
+            let name = format!("{TEMPORARY}/{}-{}", std::process::id(), state.n_temporary);
+            let path = self.root.join(&name);
+            // An earlier process with the same id may have left one behind.
+            if !self.disk.exists(&path) {
+                state.held.insert(name.clone(), Instant::now());
+                return (path, name);
+            }
+        }
+    }
+
+    fn cached(&self, file: &str, blake3: Digest) -> Option<MappedDescription> {
+        let mut state = self.state();
+        let found = state
+            .cache
+            .iter()
+            .position(|(f, b, _)| f == file && *b == blake3)?;
+        let entry = state.cache.remove(found);
+        let mapped = entry.2.clone();
+        state.cache.push(entry);
+        Some(mapped)
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        // Every change of the state is complete in itself, so a panic elsewhere left it whole.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn trim_cache(&mut self) {
+        let mut total: usize = self
+            .cache
+            .iter()
+            .map(|(_, _, mapped)| mapped.file_len())
+            .sum();
+        while total > self.cache_bytes {
+            total -= self.cache.remove(0).2.file_len();
+        }
+    }
+}
+
+/// Maps the array file of a row; a file that is missing or wrong is damage.
+pub(super) fn map_description(
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<MappedDescription, StoreError> {
+    let path = root.join(&row.file);
+    match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
+        Ok(mapped) => Ok(mapped),
+        Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
+            Err(StoreError::io(&path, e))
+        }
+        Err(e) => Err(damaged(&row.file, e)),
+    }
+}
+
+/// Reads the original of a row; a file that is missing or wrong is damage.
+pub(super) fn read_original(
+    disk: &dyn Disk,
+    root: &Path,
+    row: &ObjectRow,
+) -> Result<Vec<u8>, StoreError> {
+    let path = root.join(&row.file);
+    let stored = match disk.read(&path) {
+        Ok(stored) => stored,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
+        Err(e) => return Err(StoreError::io(&path, e)),
+    };
+    let (found, expected) = (stored.len() as u64, row.length);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Length { found, expected }));
+    }
+    let (found, expected) = (Digest::of(&stored), row.blake3);
+    if found != expected {
+        return Err(damaged(&row.file, ArrayFileError::Digest { found, expected }));
+    }
+    let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
+    let found = Digest::of(&bytes);
+    if found != row.digest {
+        let message = format!("its content's BLAKE3 is {found}, but its name is {}", row.digest);
+        return Err(damaged(&row.file, message));
+    }
+    Ok(bytes)
+}
+
+/// The name of a file below the library's folder, as the catalog has it.
+pub(super) fn relative(root: &Path, path: &Path) -> String {
+    path.strip_prefix(root)
+        .unwrap_or(path)
+        .display()
+        .to_string()
+}
+
+fn damaged(file: &str, message: impl ToString) -> StoreError {
+    StoreError::Damaged {
+        path: file.to_string(),
+        message: message.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,275 @@
+//! The real binary as a daemon in a folder of its own, and meshes to feed it.
+
+use coseg::ipc::client::Client;
+use coseg::ipc::wire::{self, ErrorCode, ErrorReason, reply, request};
+use rustix::process::{Pid, Signal};
+use std::io::{BufRead as _, BufReader};
+use std::os::unix::net::UnixDatagram;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
+use tempfile::TempDir;
+
+/// Long enough for a machine that is busy with other tests; only a failing test waits so long.
+pub const DEADLINE: Duration = Duration::from_secs(60);
+
+/// The binary with nothing of this process's settings.
+pub fn coseg() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_coseg"));
+    for (name, _) in std::env::vars_os() {
+        if name.to_string_lossy().starts_with("COSEG") {
+            command.env_remove(name);
+        }
+    }
+    for name in ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "RUNTIME_DIRECTORY"] {
+        command.env_remove(name);
+    }
+    command.env("NO_COLOR", "1");
+    command
+}
+
+/// A folder for a daemon: socket, library, notify socket.
+pub struct Home {
+    pub dir: TempDir,
+}
+
+impl Home {
+    pub fn new() -> Self {
+        Self { dir: tempfile::Builder::new().prefix("coseg").tempdir().unwrap() }
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    pub fn endpoint(&self) -> String {
+        format!("ipc://{}", self.path("s").display())
+    }
+
+    /// A client command for this home's daemon.
+    pub fn coseg(&self, args: &[&str]) -> Output {
+        let mut command = coseg();
+        command.args(args).env("COSEG_ENDPOINT", self.endpoint());
+        // A test machine may be slow; what is tested with the default says so itself.
+        if !args.contains(&"--timeout") {
+            command.args(["--timeout", "60"]);
+        }
+        command.output().unwrap()
+    }
+
+    /// Writes a mesh file and returns its path.
+    pub fn mesh(&self, name: &str, text: &str) -> String {
+        let path = self.path(name);
+        std::fs::write(&path, text).unwrap();
+        path.display().to_string()
+    }
+
+    pub fn start(&self) -> Daemon {
+        self.start_with(&[], &[])
+    }
+
+    /// Starts a daemon and waits until it says that it is ready.
+    pub fn start_with(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
+        let mut daemon = self.spawn(args, env);
+        daemon.await_notice("READY=1");
+        daemon
+    }
+
+    /// Starts a daemon that may refuse to start.
+    pub fn spawn(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
+        let notify_path = self.path("notify");
+        let _ = std::fs::remove_file(&notify_path);
+        let notify = UnixDatagram::bind(&notify_path).unwrap();
+        notify.set_read_timeout(Some(DEADLINE)).unwrap();
+        let mut command = coseg();
+        command.arg("serve").arg("--library").arg(self.path("library"));
+        if !args.contains(&"--endpoint") {
+            command.args(["--endpoint", &self.endpoint()]);
+        }
+        command.args(args).env("NOTIFY_SOCKET", &notify_path).envs(env.iter().copied());
+        let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
+        let (lines_in, lines) = mpsc::channel();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        std::thread::spawn(move || {
+            for line in stderr.lines().map_while(Result::ok) {
+                if lines_in.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Daemon { child, notify, lines, said: Vec::new(), endpoint: self.endpoint() }
+    }
+}
+
+/// A running daemon; killed when dropped.
+pub struct Daemon {
+    pub child: Child,
+    pub notify: UnixDatagram,
+    lines: mpsc::Receiver<String>,
+    /// Lines of stderr so far.
+    pub said: Vec<String>,
+    pub endpoint: String,
+}
+
+impl Daemon {
+    /// Waits for a message to the service manager that has this line.
+    pub fn await_notice(&mut self, line: &str) -> String {
+        let mut buffer = [0_u8; 4096];
+        loop {
+            let n = self.notify.recv(&mut buffer).unwrap_or_else(|e| {
+                panic!("no {line:?} ({e}); stderr: {:#?}", self.lines.try_iter().collect::<Vec<_>>())
+            });
+            let text = String::from_utf8(buffer[..n].to_vec()).unwrap();
+            if text.lines().any(|l| l == line) {
+                return text;
+            }
+        }
+    }
+
+    /// Waits for a line of stderr that has this text.
+    pub fn await_line(&mut self, text: &str) -> String {
+        loop {
+            let line = self.lines.recv_timeout(DEADLINE);
+            let line = line.unwrap_or_else(|e| panic!("no {text:?} ({e}) after {:#?}", self.said));
+            self.said.push(line.clone());
+            if line.contains(text) {
+                return line;
+            }
+        }
+    }
+
+    pub fn client(&self) -> Client {
+        Client::connect(&self.endpoint, DEADLINE).unwrap()
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, signal).unwrap();
+    }
+
+    /// Waits until the process has ended.
+    pub fn ended(mut self) -> (ExitStatus, Vec<String>) {
+        let pid = Pid::from_child(&self.child);
+        let (over_in, over) = mpsc::channel::<()>();
+        let guard = std::thread::spawn(move || {
+            if over.recv_timeout(DEADLINE).is_err() {
+                let _ = rustix::process::kill_process(pid, Signal::KILL);
+            }
+        });
+        let status = self.child.wait().unwrap();
+        let _ = over_in.send(());
+        guard.join().unwrap();
+        let mut said = std::mem::take(&mut self.said);
+        said.extend(self.lines.iter());
+        (status, said)
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Sends a request and returns the code and reason of the refusal.
+pub fn refusal(client: &mut Client, body: request::Body) -> (ErrorCode, ErrorReason) {
+    match client.call(body, Vec::new()) {
+        Err(coseg::ipc::client::ClientError::Refused(e)) => (e.code(), e.reason()),
+        Ok((result, _)) => panic!("not refused: {result:?}"),
+        Err(e) => panic!("no reply: {e}"),
+    }
+}
+
+/// Adds shapes and waits for the finished job.
+pub fn add(client: &mut Client, collection: &str, shapes: &[(&str, &str)]) -> wire::Job {
+    let (body, frames) = add_request(collection, shapes, wire::AddMode::Wait);
+    match client.call(body, frames).unwrap().0 {
+        reply::Result::AddShapes(reply) => reply.job.unwrap(),
+        other => panic!("unexpected: {other:?}"),
+    }
+}
+
+/// A request that adds OFF texts, creating the collection with two parts.
+pub fn add_request(
+    collection: &str,
+    shapes: &[(&str, &str)],
+    mode: wire::AddMode,
+) -> (request::Body, Vec<bytes::Bytes>) {
+    let inputs = shapes.iter().enumerate().map(|(i, (name, _))| wire::ShapeInput {
+        name: (*name).to_owned(),
+        replace: false,
+        source: Some(wire::shape_input::Source::Encoded(wire::EncodedMesh {
+            format: wire::MeshFormat::Off.into(),
+            bytes: Some(wire::BytesRef { frame: i as u32 }),
+        })),
+    });
+    let request = wire::AddShapesRequest {
+        collection: collection.to_owned(),
+        shapes: inputs.collect(),
+        mode: mode.into(),
+        create: Some(wire::CollectionSpec { n_parts: Some(2), ..Default::default() }),
+    };
+    let frames = shapes.iter().map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
+    (request::Body::AddShapes(request), frames.collect())
+}
+
+/// A closed surface of 2 × 16 × 23 triangles like a skittle: a body and a head, of varying proportions.
+pub fn skittle(variant: u32) -> String {
+    let (rings, sectors) = (24_u32, 16_u32);
+    let mut vertices = vec![[0.0, 0.0, -1.0]];
+    let vary = f64::from(variant);
+    for ring in 1..rings {
+        let t = f64::from(ring) / f64::from(rings);
+        let z = -1.0 + t * (3.0 + 0.1 * vary);
+        let body = (std::f64::consts::PI * t).sin();
+        let neck = 1.0 - (0.55 + 0.02 * vary) * (-((t - 0.68) / 0.1).powi(2)).exp();
+        for sector in 0..sectors {
+            let angle = std::f64::consts::TAU * f64::from(sector) / f64::from(sectors);
+            let r = body * neck * (1.0 + 0.05 * (angle * 2.0 + vary).sin());
+            vertices.push([r * angle.cos(), r * angle.sin(), z]);
+        }
+    }
+    vertices.push([0.0, 0.0, 2.0 + 0.1 * vary]);
+    let at = |ring: u32, sector: u32| 1 + (ring - 1) * sectors + sector % sectors;
+    let last = vertices.len() as u32 - 1;
+    let mut faces = Vec::new();
+    for s in 0..sectors {
+        faces.push([0, at(1, s + 1), at(1, s)]);
+        faces.push([last, at(rings - 1, s), at(rings - 1, s + 1)]);
+        for ring in 1..rings - 1 {
+            faces.push([at(ring, s), at(ring, s + 1), at(ring + 1, s)]);
+            faces.push([at(ring, s + 1), at(ring + 1, s + 1), at(ring + 1, s)]);
+        }
+    }
+    let mut text = format!("OFF\n{} {} 0\n", vertices.len(), faces.len());
+    for [x, y, z] in vertices {
+        text.push_str(&format!("{x} {y} {z}\n"));
+    }
+    for [a, b, c] in faces {
+        text.push_str(&format!("3 {a} {b} {c}\n"));
+    }
+    text
+}
+
+/// Faces of a [`skittle`].
+pub const SKITTLE_FACES: usize = 2 * 16 * 23;
+
+/// Standard output as text; the command must have ended with `code`.
+pub fn stdout(output: &Output, code: i32) -> String {
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "stderr: {stderr}");
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+/// Standard output as JSON; it must be nothing else.
+pub fn json(output: &Output, code: i32) -> serde_json::Value {
+    let text = stdout(output, code);
+    serde_json::from_str(&text).unwrap_or_else(|e| panic!("{e}: {text}"))
+}
+
+/// Whether a path exists, for assertions that read well.
+pub fn exists(path: impl AsRef<Path>) -> bool {
+    path.as_ref().exists()
+}
