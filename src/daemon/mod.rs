@@ -321,7 +321,7 @@ impl Running {
         self.daemon.work.progress().close();
         let daemon = Arc::clone(&self.daemon);
         let publisher = self.publisher.take();
-        let ended = runtime.block_on(tokio::time::timeout(limit, async move {
+        let last_work = async move {
             daemon.lanes_ended().await;
             let max = u32::try_from(daemon.max_pending).unwrap_or(u32::MAX);
             let answered = Arc::clone(&daemon.pending).acquire_many_owned(max);
@@ -332,7 +332,9 @@ impl Running {
             if let Some(publisher) = publisher {
                 let _ = publisher.await;
             }
-        }));
+        };
+        // Inside, for the timer needs the runtime.
+        let ended = runtime.block_on(async { tokio::time::timeout(limit, last_work).await });
         if ended.is_err() {
             tracing::warn!("the drain took longer than {} s", limit.as_secs());
         }

@@ -103,16 +103,21 @@ async fn change_in_order(
     daemon: Arc<Daemon>,
     mut changes: mpsc::UnboundedReceiver<(Body, InHand)>,
 ) {
-    while let Some((body, in_hand)) = changes.recv().await {
-        let request = &in_hand.incoming.request;
-        let key = writes::key(request);
-        let frames = in_hand.incoming.frames.clone();
+    while let Some((body, mut in_hand)) = changes.recv().await {
         if in_hand.is_late() {
             in_hand.late(&daemon, None);
             continue;
         }
-        let done =
-            blocking(&daemon, move |d| writes::change(d, &body, &frames, key.as_ref())).await;
+        let key = writes::key(&in_hand.incoming.request);
+        let frames = std::mem::take(&mut in_hand.incoming.frames);
+        // Given back when the change is made: who waits for the placing holds no frames.
+        let memory = in_hand.incoming.memory.take();
+        let done = blocking(&daemon, move |d| {
+            let _memory = memory;
+            let (body, frames) = (body, frames);
+            writes::change(d, &body, &frames, key.as_ref())
+        });
+        let done = done.await;
         match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
             Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((result, Vec::new()))),
             Ok(writes::Done::WhenPlaced(job)) => {

@@ -58,8 +58,8 @@ pub(crate) struct Incoming {
     pub(crate) request: Request,
     pub(crate) frames: Vec<Bytes>,
     pub(crate) received: Instant,
-    /// Given back when the request is dropped.
-    pub(crate) _memory: Reservation,
+    /// Held for as long as the frames are.
+    pub(crate) memory: Option<Reservation>,
 }
 
 enum Outgoing {
@@ -131,7 +131,8 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
             socket.set_linger(LINGER_MS)?;
             socket.set_heartbeat_ivl(HEARTBEAT_MS)?;
             socket.set_heartbeat_timeout(HEARTBEAT_TIMEOUT_MS)?;
-            socket.set_ipv6(true)?;
+            // Not for an IPv4 address, which would come back as one mapped into IPv6.
+            socket.set_ipv6(matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('[')))?;
         }
         let (wake, wake_sender) = (context.socket(zmq::PULL)?, context.socket(zmq::PUSH)?);
         wake.bind("inproc://wake")?;
@@ -278,7 +279,7 @@ impl SocketThread {
             let text = format!("requests in hand leave no memory for {n_bytes} bytes more");
             return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
         };
-        let incoming = Incoming { peer, request, frames, received, _memory: memory };
+        let incoming = Incoming { peer, request, frames, received, memory: Some(memory) };
         if let Err(refused) = self.requests.try_send(incoming) {
             let incoming = refused.into_inner();
             let text = "too many requests wait".to_owned();

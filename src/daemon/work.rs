@@ -105,7 +105,11 @@ impl Daemon {
                 continue;
             }
             self.ensure_lane(&waiting.item.collection);
-            self.work.progress().push(waiting);
+            let mut progress = self.work.progress();
+            // Without a lane the daemon drains, and the shape is taken up at the next start.
+            if progress.lane(&waiting.item.collection).is_some() {
+                progress.push(waiting);
+            }
         }
         self.work.changed();
         self.work.arrived.notify_one();

@@ -74,7 +74,7 @@ fn junk_gets_an_error_and_the_daemon_lives() {
     // Length-delimited fields of unknown number, one inside the other.
     let mut deep = Vec::new();
     for _ in 0..1_000 {
-        let mut outer = vec![0xfa, 0x01];
+        let mut outer = vec![0xa2, 0x06]; // field 100
         prost::encoding::encode_varint(deep.len() as u64, &mut outer);
         outer.extend_from_slice(&deep);
         deep = outer;
@@ -368,7 +368,7 @@ fn events_arrive_in_order_and_are_those_of_the_log() {
     let Some(Kind::Heartbeat(heartbeat)) = heartbeat.kind else { panic!("no heartbeat") };
     let stands: Vec<_> = heartbeat.collections.iter().map(|c| c.collection.as_str()).collect();
     assert_eq!(stands, ["c", "cc"]);
-    add(client, "cc", &[("x", &skittle(3))]);
+    add_again(client, "cc", "x", &skittle(3));
     for i in 0..3 {
         add_again(client, "c", &format!("s{i}"), &skittle(i));
     }
