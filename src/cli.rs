@@ -1,8 +1,10 @@
 //! What was typed becomes one command with typed flags.
 
+use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use coseg::ipc::wire;
+use coseg::operators;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -93,6 +95,8 @@ pub(crate) enum Command {
     Stats,
     /// Let the daemon finish what it is at and stop
     Stop,
+    /// Compute the spectrum and descriptors of one mesh, without a daemon
+    Describe(Describe),
     /// Make a family of labelled shapes
     Synth(SynthArgs),
     /// Verify a library's files against its catalog, without a daemon
@@ -190,6 +194,23 @@ pub(crate) enum Operator {
 }
 
 impl Operator {
+    /// As it is typed.
+    pub(crate) fn name(operator: operators::Operator) -> &'static str {
+        match operator {
+            operators::Operator::Tufted => "tufted",
+            operators::Operator::Cotan => "cotan",
+            operators::Operator::MeshLaplace => "mesh-laplace",
+        }
+    }
+
+    pub(crate) fn to_domain(self) -> operators::Operator {
+        match self {
+            Self::Tufted => operators::Operator::Tufted,
+            Self::Cotan => operators::Operator::Cotan,
+            Self::MeshLaplace => operators::Operator::MeshLaplace,
+        }
+    }
+
     fn to_wire(self) -> wire::Operator {
         match self {
             Self::Tufted => wire::Operator::Tufted,

@@ -11,10 +11,13 @@
 
 mod component;
 mod connected;
+mod iterative;
+mod polish;
 
 use crate::linalg::block_lanczos::Exhausted;
 use crate::linalg::dense_eigen::DenseEigenError;
 use crate::linalg::ldlt::LdltError;
+use crate::linalg::panel::WIDTH;
 use component::{Component, components, validate};
 use connected::{Pairs, Setting, smallest};
 use nalgebra::DMatrix;
@@ -176,6 +179,14 @@ pub enum SpectrumError {
         expected: usize,
         /// Pairs found.
         found: usize,
+    },
+    /// The Krylov space grew to its limit.
+    #[error("{k} pairs have not converged in a Krylov space of {n_krylov} vectors, the limit")]
+    NotConverged {
+        /// Wanted.
+        k: usize,
+        /// Dimension of the Krylov space.
+        n_krylov: usize,
     },
     /// Everything above the k-th eigenvalue is one cluster, as far as was computed.
     #[error("no gap was found above eigenvalue {k} among {n_krylov} approximations")]
@@ -384,14 +395,14 @@ fn assemble(
         }
         eigenvalues.push(if value < zero { 0.0 } else { value });
         residuals.push(solved[c].residuals[i]);
-        let panel = &solved[c].panels[i / connected_width()];
+        let panel = &solved[c].panels[i / WIDTH];
         let part = &parts[c];
         for ((row, &v), &s) in panel
             .iter()
             .zip(&part.vertices)
             .zip(&part.inverse_sqrt_mass)
         {
-            column[v as usize] = row.0[i % connected_width()] * s;
+            column[v as usize] = row.0[i % WIDTH] * s;
         }
         let mut largest = 0.0f64;
         for &x in column.iter() {
@@ -420,9 +431,7 @@ fn assemble(
     })
 }
 
-const fn connected_width() -> usize {
-    crate::linalg::panel::WIDTH
-}
-
+#[cfg(test)]
+mod refusal_tests;
 #[cfg(test)]
 mod tests;

@@ -4,6 +4,7 @@ mod add;
 mod check;
 mod collections;
 mod config;
+pub(crate) mod describe;
 mod events;
 mod export;
 mod export_mesh;
@@ -113,6 +114,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
     let done = match &cli.command {
         Command::Serve(args) => serve::run(args, &cli.global),
         Command::Check(args) => check::run(args, &cli.global),
+        Command::Describe(args) => describe::run(args, &cli.global),
         Command::Config(args) => config::run(args, &cli.global),
         Command::Add(args) => add::run(args, session()?),
         Command::Wait(args) => wait::run(args, session()?),

@@ -1,8 +1,8 @@
 //! A family and a seed become a folder of labelled meshes.
 
+use clap::Args;
 use coseg::mesh::write::off;
 use coseg::synth::{Family, LEAST_FACES, Options, UnknownFamily, generate};
-use clap::Args;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -159,7 +159,7 @@ fn write(path: &Path, text: &str) -> Result<(), SynthError> {
 
 #[cfg(test)]
 mod tests {
-    use super::{SynthArgs, list, run};
+    use super::{SynthArgs, list, write_family};
     use clap::Parser;
 
     #[derive(Debug, Parser)]
@@ -182,7 +182,8 @@ mod tests {
             "--out",
             out.to_str().unwrap(),
         ];
-        run(&Cli::try_parse_from(typed).unwrap().synth, false).unwrap();
+        let report = write_family(&Cli::try_parse_from(typed).unwrap().synth, false).unwrap();
+        assert!(report.starts_with("2 shapes of family pliers (3 parts) in "));
         let mut files: Vec<String> = std::fs::read_dir(&out)
             .unwrap()
             .map(|f| f.unwrap().file_name().into_string().unwrap())

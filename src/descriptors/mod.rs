@@ -1,93 +1,268 @@
-//! temp
-#![allow(missing_docs, clippy::all)]
-use crate::mesh::*;
-use nalgebra::{DMatrix, Matrix3, SymmetricEigen, Vector3};
-pub const GROUPS: &[(&str, usize)] = &[("sdf", 2), ("agd", 3), ("gc", 7), ("q", 6), ("pc", 15), ("pos", 7), ("hks", 16), ("hksn", 16), ("wks", 20)];
-pub struct FaceDescriptors { pub data: Vec<f32>, pub n: usize, pub farthest_start: u32 }
-pub fn hks_times(v: &[f64], n: usize) -> Vec<f64> {
-    let last = v[v.len() - 1]; let l2 = v.iter().copied().find(|x| *x > 1e-9 * last).unwrap_or(last);
-    let (a, b) = (4.0 * 10f64.ln() / last, 4.0 * 10f64.ln() / l2);
-    (0..n).map(|j| a * (b / a).powf(j as f64 / (n - 1) as f64)).collect()
+//! A proxy mesh and its spectrum become arrays that say what each point, each face and the whole shape
+//! look like, whatever the pose, place and numbering.
+//!
+//! Vertex descriptors: [`hks`] (the source paper's eq. 8), [`wks`], [`gps`]. Face descriptors, 92 columns
+//! in the [`GROUPS`], are what labels are told by: thickness, position along geodesics, local shape,
+//! place in the principal frame, and heat and wave kernels. [`signature`] sums up a shape.
+//! Lengths are in units of the square root of the area: the mesh has area 1.
+
+mod geodesic;
+mod local_pca;
+mod position;
+mod shape_diameter;
+mod signature;
+mod spectral;
+
+pub use geodesic::{GeodesicProfile, geodesic_profile};
+pub use local_pca::local_pca;
+pub use position::{position, up_columns};
+pub use shape_diameter::shape_diameter;
+pub use signature::{N_SHAPE_DNA, signature};
+pub use spectral::{gps, hks, hks_times, null_space, shape_dna, wks};
+
+use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh};
+use nalgebra::DMatrix;
+
+/// Names and widths of the groups of face descriptors, in column order.
+///
+/// - `sdf`: log shape diameter, 2 × its area rank
+/// - `agd`: average geodesic distance between its 1st and 99th percentile, 3 × its area rank, and over
+///   its minimum
+/// - `gc`: share of the area within seven geodesic radii
+/// - `q`: quantiles of the geodesic distance over the mean of the largest
+/// - `pc`: local principal components at three radii
+/// - `pos`: absolute position and direction in the principal frame
+/// - `hks`: log heat kernel signature over the heat trace, 16 times
+/// - `hksn`: the same less its mean over the area
+/// - `wks`: log wave kernel signature, 20 energies
+pub const GROUPS: &[(&str, usize)] = &[
+    ("sdf", 2),
+    ("agd", 3),
+    ("gc", geodesic::N_RADII),
+    ("q", geodesic::QUANTILES.len()),
+    ("pc", local_pca::N_COLUMNS),
+    ("pos", position::N_COLUMNS),
+    ("hks", N_HEAT_TIMES),
+    ("hksn", N_HEAT_TIMES),
+    ("wks", N_WAVE_ENERGIES),
+];
+
+/// Heat and wave kernels of faces use this many eigenpairs, so that shapes with more do not differ.
+const MAX_EIGENPAIRS: usize = 100;
+const N_HEAT_TIMES: usize = 16;
+const N_WAVE_ENERGIES: usize = 20;
+/// Kernel values below this are noise of the truncated sum.
+const MIN_KERNEL: f64 = 1e-6;
+/// Thicknesses below this are none.
+const MIN_DIAMETER: f64 = 1e-4;
+/// Rounds of smoothing of the shape diameter, which rays make noisy, and of all columns at the end.
+const DIAMETER_ROUNDS: usize = 3;
+const ROUNDS: usize = 2;
+
+/// Face descriptors of a shape.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FaceDescriptors {
+    /// Values `(m, n)`, row-major, smoothed, not standardised; all finite.
+    pub data: Vec<f32>,
+    /// Columns.
+    pub n: usize,
+    /// The face of largest average geodesic distance: an extremity, the same in every run.
+    pub farthest_start: u32,
 }
-pub fn hks(v: &[f64], e: &DMatrix<f64>, t: &[f64]) -> Vec<f32> {
-    let sq = e.map(|x| x * x); let w = DMatrix::from_fn(v.len(), t.len(), |i, j| (-v[i] * t[j]).exp());
-    let h = sq * w; let mut out = vec![0f32; h.nrows() * h.ncols()];
-    for i in 0..h.nrows() { for j in 0..h.ncols() { out[i * h.ncols() + j] = h[(i, j)] as f32; } } out
+
+/// Face descriptors of a proxy mesh of area 1 with its bridges, dual graph and spectrum (`eigenvalues`
+/// `(k,)` ascending, `eigenvectors (n, k)` mass-orthonormal), the columns of all [`GROUPS`].
+///
+/// Independent of rotation, reflection, translation and numbering up to rounding, with these
+/// exceptions: where principal axes are not unique (a sphere) `pos` depends on the coordinates, and the
+/// geodesic samples of a symmetric shape on the order of its vertices. About 25 ms for 2,500 faces.
+pub fn face_descriptors(
+    mesh: &TriMesh,
+    bridges: &[Bridge],
+    dual: &DualGraph,
+    eigenvalues: &[f64],
+    eigenvectors: &DMatrix<f64>,
+) -> FaceDescriptors {
+    let m = mesh.faces.len();
+    let n = GROUPS.iter().map(|g| g.1).sum();
+    let geometry = FaceGeometry::new(mesh);
+    let areas = &geometry.areas;
+    let mut columns = Columns {
+        data: vec![0.0; m * n],
+        n,
+        next: 0,
+    };
+
+    let mut diameter = shape_diameter(mesh, &geometry);
+    smooth(dual, &mut diameter, 1, DIAMETER_ROUNDS);
+    let logs: Vec<f64> = diameter.iter().map(|d| d.max(MIN_DIAMETER).ln()).collect();
+    let ranks = area_ranks(&logs, areas);
+    columns.push(2, |f, row| row.copy_from_slice(&[logs[f], 2.0 * ranks[f]]));
+
+    let profile = geodesic_profile(mesh, bridges, &geometry);
+    let agd = to_faces(mesh, &profile.average, 1);
+    let ranks = area_ranks(&agd, areas);
+    let mut sorted = agd.clone();
+    sorted.sort_by(f64::total_cmp);
+    let (low, high) = (quantile(&sorted, 0.01), quantile(&sorted, 0.99));
+    let least = sorted.first().map_or(1.0, |x| x.max(1e-9));
+    columns.push(3, |f, row| {
+        let between = (agd[f] - low) / (high - low + 1e-9);
+        row.copy_from_slice(&[between, 3.0 * ranks[f], agd[f] / least - 1.0]);
+    });
+
+    let within = to_faces(mesh, &profile.area_within, geodesic::N_RADII);
+    columns.push_all(geodesic::N_RADII, &within);
+
+    let n_quantiles = geodesic::QUANTILES.len();
+    let quantiles = to_faces(mesh, &profile.quantiles, n_quantiles);
+    let mean = area_mean(&quantiles, n_quantiles, areas)[n_quantiles - 1].max(1e-9);
+    columns.push(n_quantiles, |f, row| {
+        for (x, q) in row.iter_mut().zip(&quantiles[f * n_quantiles..]) {
+            *x = q / mean;
+        }
+    });
+
+    columns.push_all(local_pca::N_COLUMNS, &local_pca(&geometry));
+    columns.push_all(position::N_COLUMNS, &position(&geometry));
+
+    let k = eigenvalues
+        .len()
+        .min(eigenvectors.ncols())
+        .min(MAX_EIGENPAIRS);
+    let kernels = spectral::kernels(
+        &eigenvalues[..k],
+        eigenvectors,
+        N_HEAT_TIMES,
+        N_WAVE_ENERGIES,
+    );
+    let width = N_HEAT_TIMES + N_WAVE_ENERGIES;
+    let mut kernels = to_faces(mesh, &kernels, width);
+    for x in &mut kernels {
+        *x = x.max(MIN_KERNEL).ln();
+    }
+    let means = area_mean(&kernels, width, areas);
+    columns.push(N_HEAT_TIMES, |f, row| {
+        row.copy_from_slice(&kernels[f * width..f * width + N_HEAT_TIMES]);
+    });
+    columns.push(N_HEAT_TIMES, |f, row| {
+        for (j, x) in row.iter_mut().enumerate() {
+            *x = kernels[f * width + j] - means[j];
+        }
+    });
+    columns.push(N_WAVE_ENERGIES, |f, row| {
+        row.copy_from_slice(&kernels[f * width + N_HEAT_TIMES..(f + 1) * width]);
+    });
+
+    let mut data = columns.data;
+    smooth(dual, &mut data, n, ROUNDS);
+    let farthest = (0..m).fold(0, |a, b| if agd[b] > agd[a] { b } else { a });
+    FaceDescriptors {
+        data: data.iter().map(|&x| x as f32).collect(),
+        n,
+        farthest_start: farthest as u32,
+    }
 }
-fn smooth(dual: &DualGraph, x: &mut Vec<f64>, dim: usize, rounds: usize) {
-    let m = dual.n_faces();
-    let mut adj = vec![vec![]; m]; for e in &dual.edges { let [a, b] = e.faces; adj[a as usize].push(b as usize); adj[b as usize].push(a as usize); }
-    for _ in 0..rounds { let old = x.clone(); for f in 0..m { if adj[f].is_empty() { continue; } for c in 0..dim { let s: f64 = adj[f].iter().map(|g| old[g * dim + c]).sum::<f64>() / adj[f].len() as f64; x[f * dim + c] = 0.5 * old[f * dim + c] + 0.5 * s; } } }
+
+/// A row-major matrix that is filled group by group.
+struct Columns {
+    data: Vec<f64>,
+    n: usize,
+    next: usize,
 }
-pub fn up_columns(mesh: &TriMesh, axis: [f64; 3]) -> Vec<[f32; 3]> {
-    let g = FaceGeometry::new(mesh); let b = bridges(mesh); let dual = DualGraph::new(mesh, &b);
-    let m = g.areas.len(); let d = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    let h: Vec<f64> = g.centroids.iter().map(|c| d(*c, axis)).collect();
-    let (lo, hi) = h.iter().fold((f64::MAX, f64::MIN), |a, x| (a.0.min(*x), a.1.max(*x)));
-    let tot: f64 = g.areas.iter().sum(); let mut c0 = [0.0; 3];
-    for f in 0..m { for k in 0..3 { c0[k] += g.areas[f] * g.centroids[f][k] / tot; } }
-    let r: Vec<f64> = g.centroids.iter().map(|c| { let x = [c[0] - c0[0], c[1] - c0[1], c[2] - c0[2]]; let u = d(x, axis); (d(x, x) - u * u).max(0.0).sqrt() }).collect();
-    let rm = r.iter().fold(0.0f64, |a, x| a.max(*x));
-    let mut x: Vec<f64> = (0..m).flat_map(|f| [(h[f] - lo) / (hi - lo + 1e-9), r[f] / (rm + 1e-9), d(g.normals[f], axis)]).collect();
-    smooth(&dual, &mut x, 3, 2);
-    x.chunks(3).map(|c| [c[0] as f32, c[1] as f32, c[2] as f32]).collect()
+
+impl Columns {
+    /// The next `width` columns; `fill` writes those of one face.
+    fn push(&mut self, width: usize, mut fill: impl FnMut(usize, &mut [f64])) {
+        for (f, row) in self.data.chunks_exact_mut(self.n).enumerate() {
+            fill(f, &mut row[self.next..self.next + width]);
+        }
+        self.next += width;
+    }
+
+    /// The next `width` columns from a row-major matrix of that width.
+    fn push_all(&mut self, width: usize, values: &[f64]) {
+        self.push(width, |f, row| {
+            row.copy_from_slice(&values[f * width..(f + 1) * width])
+        });
+    }
 }
-fn eig(c: Matrix3<f64>) -> ([f64; 3], [Vector3<f64>; 3]) { let s = SymmetricEigen::new(c); let mut o = [0, 1, 2]; o.sort_by(|a, b| s.eigenvalues[*b].total_cmp(&s.eigenvalues[*a])); (o.map(|i| s.eigenvalues[i].max(1e-12)), o.map(|i| s.eigenvectors.column(i).into_owned())) }
-fn rank(x: &[f64], a: &[f64]) -> Vec<f64> { let mut o: Vec<usize> = (0..x.len()).collect(); o.sort_by(|p, q| x[*p].total_cmp(&x[*q])); let t: f64 = a.iter().sum(); let mut r = vec![0.0; x.len()]; let mut c = 0.0; for i in o { r[i] = (c + 0.5 * a[i]) / t; c += a[i]; } r }
-pub fn face_descriptors(mesh: &TriMesh, br: &[Bridge], dual: &DualGraph, v: &[f64], e: &DMatrix<f64>) -> FaceDescriptors {
-    let g = FaceGeometry::new(mesh); let m = g.areas.len(); let nv = mesh.vertices.len(); let a = &g.areas;
-    let graph = EdgeGraph::new(mesh, br);
-    let mut va = vec![0.0; nv]; for f in 0..m { for q in mesh.faces[f] { va[q as usize] += a[f] / 3.0; } }
-    // geodesics
-    let ns = 60.min(nv); let first = graph.dijkstra(0); let mut cur = vec![f64::INFINITY; nv]; let mut src = (0..nv).max_by(|x, y| first[*x].total_cmp(&first[*y])).unwrap();
-    let mut d: Vec<Vec<f64>> = vec![]; for _ in 0..ns { let x = graph.dijkstra(src as u32); for i in 0..nv { cur[i] = cur[i].min(x[i]); } d.push(x); src = (0..nv).max_by(|x, y| cur[*x].total_cmp(&cur[*y])).unwrap(); }
-    let mut ws = vec![0.0; ns]; for i in 0..nv { let o = (0..ns).min_by(|x, y| d[*x][i].total_cmp(&d[*y][i])).unwrap(); ws[o] += va[i]; } let t: f64 = ws.iter().sum(); ws.iter_mut().for_each(|w| *w /= t);
-    let mut mx: Vec<f64> = (0..nv).map(|i| (0..ns).map(|s| d[s][i]).fold(0.0, f64::max)).collect(); mx.sort_by(f64::total_cmp); let gmax = mx[nv / 2];
-    let mut vagd = vec![0.0; nv]; let mut vq = vec![[0.0; 6]; nv]; let mut vgc = vec![[0.0; 7]; nv];
-    for i in 0..nv { let mut s: Vec<f64> = (0..ns).map(|k| d[k][i]).collect(); vagd[i] = s.iter().zip(&ws).map(|(x, w)| x * w).sum();
-        for (j, q) in (1..8).enumerate() { let b = 1.5 * q as f64 / 8.0; vgc[i][j] = (0..ns).filter(|k| d[*k][i] / gmax <= b).map(|k| ws[k]).sum(); }
-        s.sort_by(f64::total_cmp); for (j, q) in [0.1, 0.25, 0.5, 0.75, 0.9, 1.0].iter().enumerate() { let p = q * (ns - 1) as f64; let lo = p.floor() as usize; let hi = (lo + 1).min(ns - 1); vq[i][j] = s[lo] + (p - lo as f64) * (s[hi] - s[lo]); } }
-    let tof = |x: &dyn Fn(usize) -> f64| -> Vec<f64> { mesh.faces.iter().map(|f| f.iter().map(|q| x(*q as usize)).sum::<f64>() / 3.0).collect() };
-    // sdf
-    let bvh = Bvh::new(mesh); let nr = 30; let mut sdf = vec![f64::NAN; m];
-    let loc: Vec<([f64; 3], f64)> = (0..nr).map(|i| { let u = (i as f64 + 0.5) / nr as f64; let th = (1.0 - u * (1.0 - 60f64.to_radians().cos())).acos(); let ph = i as f64 * 2.399963; ([th.sin() * ph.cos(), th.sin() * ph.sin(), th.cos()], th) }).collect();
-    for f in 0..m { let n = Vector3::from(g.normals[f]) * -1.0; let ax = if n[0].abs() > 0.9 { Vector3::y() } else { Vector3::x() }; let tt = n.cross(&ax).normalize(); let b = n.cross(&tt); let o = Vector3::from(g.centroids[f]) + n * 1e-4;
-        let mut ds: Vec<(f64, f64)> = loc.iter().filter_map(|(l, th)| { let dir = tt * l[0] + b * l[1] + n * l[2]; bvh.cast(o.into(), dir.into(), f as u32).map(|x| (x, *th)) }).collect();
-        if ds.is_empty() { continue; } ds.sort_by(|x, y| x.0.total_cmp(&y.0)); let med = if ds.len() % 2 == 1 { ds[ds.len() / 2].0 } else { 0.5 * (ds[ds.len() / 2].0 + ds[ds.len() / 2 - 1].0) }; let mean = ds.iter().map(|x| x.0).sum::<f64>() / ds.len() as f64; let sd = (ds.iter().map(|x| (x.0 - mean).powi(2)).sum::<f64>() / ds.len() as f64).sqrt();
-        let (mut s, mut w) = (0.0, 0.0); for (x, th) in ds { if (x - med).abs() <= 1.5 * sd + 1e-9 { let q = 1.0 / (th + 0.2); s += q * x; w += q; } } if w > 1e-9 { sdf[f] = s / w; } }
-    let mut ok: Vec<f64> = sdf.iter().copied().filter(|x| x.is_finite()).collect(); ok.sort_by(f64::total_cmp); let med = ok.get(ok.len() / 2).copied().unwrap_or(0.1); for x in &mut sdf { if !x.is_finite() { *x = med; } }
-    smooth(dual, &mut sdf, 1, 3);
-    let ls: Vec<f64> = sdf.iter().map(|x| x.max(1e-4).ln()).collect(); let rs = rank(&ls, a);
-    let agd = tof(&|i| vagd[i]); let ra = rank(&agd, a); let mut sa = agd.clone(); sa.sort_by(f64::total_cmp); let pc = |p: f64| { let x = p * (m - 1) as f64; let l = x.floor() as usize; sa[l] + (x - l as f64) * (sa[(l + 1).min(m - 1)] - sa[l]) }; let (p1, p99) = (pc(0.01), pc(0.99)); let mn = sa[0];
-    let q: Vec<Vec<f64>> = (0..6).map(|j| tof(&|i| vq[i][j])).collect(); let q5: f64 = (0..m).map(|f| a[f] * q[5][f]).sum::<f64>() / a.iter().sum::<f64>();
-    let gc: Vec<Vec<f64>> = (0..7).map(|j| tof(&|i| vgc[i][j])).collect();
-    // local PCA
-    let mut pcs = vec![vec![]; m];
-    for r in [0.05f64, 0.1, 0.2] { let key = |c: [f64; 3]| [(c[0] / r).floor() as i64, (c[1] / r).floor() as i64, (c[2] / r).floor() as i64]; let mut grid: std::collections::HashMap<[i64; 3], Vec<u32>> = Default::default(); for f in 0..m { grid.entry(key(g.centroids[f])).or_default().push(f as u32); }
-        for f in 0..m { let k = key(g.centroids[f]); let mut nb = vec![]; for x in -1..2 { for y in -1..2 { for z in -1..2 { if let Some(l) = grid.get(&[k[0] + x, k[1] + y, k[2] + z]) { for &h in l { let p = g.centroids[h as usize]; let q = g.centroids[f]; if (p[0] - q[0]).powi(2) + (p[1] - q[1]).powi(2) + (p[2] - q[2]).powi(2) <= r * r { nb.push(h as usize); } } } } } }
-            let w: f64 = nb.iter().map(|h| a[*h]).sum(); let mut c = Vector3::zeros(); for h in &nb { c += a[*h] / w * Vector3::from(g.centroids[*h]); } let mut cov = Matrix3::zeros(); for h in &nb { let x = Vector3::from(g.centroids[*h]) - c; cov += a[*h] / w * x * x.transpose(); } let (ev, vec) = eig(cov);
-            pcs[f].extend([(ev[0] - ev[1]) / ev[0], (ev[1] - ev[2]) / ev[0], ev[2] / ev[0], w / (std::f64::consts::PI * r * r), Vector3::from(g.normals[f]).dot(&vec[0]).abs()]); } }
-    // position
-    let ta: f64 = a.iter().sum(); let mut c = Vector3::zeros(); for f in 0..m { c += a[f] / ta * Vector3::from(g.centroids[f]); } let mut cov = Matrix3::zeros(); for f in 0..m { let x = Vector3::from(g.centroids[f]) - c; cov += a[f] * x * x.transpose(); } let (_, ax) = eig(cov);
-    // spectral
-    let kk = v.len().min(100); let w = &v[..kk]; let last = w[kk - 1]; let l2 = w.iter().copied().find(|x| *x > 1e-9 * last).unwrap_or(last).max(1e-3);
-    let ts: Vec<f64> = (0..16).map(|j| 4.0 * 10f64.ln() / last * (last / l2).powf(j as f64 / 15.0)).collect();
-    let e2 = e.columns(0, kk).map(|x| x * x); let mut wt = DMatrix::from_fn(kk, 16, |i, j| (-w[i] * ts[j]).exp()); for mut col in wt.column_iter_mut() { let s = col.sum(); col /= s; } let hv = &e2 * wt;
-    let le: Vec<f64> = w[1..].iter().map(|x| x.max(1e-6).ln()).collect(); let (e0, e1) = (le[0], le[kk - 2]); let sig = 7.0 * (e1 - e0) / 100.0;
-    let mut ww = DMatrix::from_fn(kk, 20, |i, j| if i == 0 { 0.0 } else { let en = e0 + (e1 - e0) * j as f64 / 19.0; (-(en - le[i - 1]).powi(2) / (2.0 * sig * sig + 1e-12)).exp() }); for mut col in ww.column_iter_mut() { let s = col.sum().max(1e-12); col /= s; } let wv = &e2 * ww;
-    let hf: Vec<Vec<f64>> = (0..16).map(|j| tof(&|i| hv[(i, j)]).iter().map(|x| x.max(1e-6).ln()).collect()).collect();
-    let wf: Vec<Vec<f64>> = (0..20).map(|j| tof(&|i| wv[(i, j)]).iter().map(|x| x.max(1e-6).ln()).collect()).collect();
-    let hm: Vec<f64> = hf.iter().map(|h| (0..m).map(|f| a[f] * h[f]).sum::<f64>() / ta).collect();
-    let mut x = Vec::with_capacity(m * 92);
-    for f in 0..m { x.extend([ls[f], 2.0 * rs[f], (agd[f] - p1) / (p99 - p1 + 1e-9), 3.0 * ra[f] , agd[f] / mn - 1.0]); x.extend(gc.iter().map(|c| c[f])); x.extend(q.iter().map(|c| c[f] / q5)); x.extend(&pcs[f]);
-        let p = Vector3::from(g.centroids[f]) - c; let n = Vector3::from(g.normals[f]); x.extend(ax.iter().map(|u| u.dot(&p).abs())); x.push(p.norm()); x.extend(ax.iter().map(|u| u.dot(&n).abs()));
-        x.extend(hf.iter().map(|h| h[f])); x.extend(hf.iter().zip(&hm).map(|(h, mu)| h[f] - mu)); x.extend(wf.iter().map(|h| h[f])); }
-    smooth(dual, &mut x, 92, 2);
-    let farthest_start = (0..m).max_by(|p, q| agd[*p].total_cmp(&agd[*q])).unwrap_or(0) as u32;
-    FaceDescriptors { data: x.iter().map(|v| *v as f32).collect(), n: 92, farthest_start }
+
+/// Means over the corners of each face `(m, dim)` of values at vertices `(n, dim)`, row-major.
+fn to_faces(mesh: &TriMesh, values: &[f64], dim: usize) -> Vec<f64> {
+    let mut result = Vec::with_capacity(mesh.faces.len() * dim);
+    for face in &mesh.faces {
+        let [a, b, c] = face.map(|v| &values[v as usize * dim..(v as usize + 1) * dim]);
+        result.extend(a.iter().zip(b).zip(c).map(|((a, b), c)| (a + b + c) / 3.0));
+    }
+    result
 }
-pub fn signature(mesh: &TriMesh, face: &FaceDescriptors, _v: &[f64]) -> Vec<f32> {
-    let a = FaceGeometry::new(mesh).areas; let m = a.len(); let n = face.n; let ta: f64 = a.iter().sum(); let mut out = vec![0f32; 4 * n];
-    for c in 0..n { let mut x: Vec<(f32, f64)> = (0..m).map(|f| (face.data[f * n + c], a[f])).collect(); out[c] = (x.iter().map(|p| p.0 as f64 * p.1).sum::<f64>() / ta) as f32; x.sort_by(|p, q| p.0.total_cmp(&q.0)); for (k, q) in [0.1, 0.5, 0.9].iter().enumerate() { let mut s = 0.0; for p in &x { s += p.1; if s >= q * ta { out[(k + 1) * n + c] = p.0; break; } } } }
-    out
+
+/// Area-weighted mean of each column `(dim,)` of values at faces `(m, dim)`.
+fn area_mean(values: &[f64], dim: usize, areas: &[f64]) -> Vec<f64> {
+    let mut mean = vec![0.0; dim];
+    for (row, &area) in values.chunks_exact(dim).zip(areas) {
+        for (sum, x) in mean.iter_mut().zip(row) {
+            *sum += area * x;
+        }
+    }
+    let total: f64 = areas.iter().sum();
+    mean.iter().map(|sum| sum / total).collect()
 }
+
+/// Share of the area on which the value is smaller, half of the own area included; 0 to 1.
+fn area_ranks(values: &[f64], areas: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|&a, &b| values[a].total_cmp(&values[b]).then(a.cmp(&b)));
+    let total: f64 = areas.iter().sum();
+    let mut ranks = vec![0.0; values.len()];
+    let mut below = 0.0;
+    for f in order {
+        ranks[f] = (below + 0.5 * areas[f]) / total;
+        below += areas[f];
+    }
+    ranks
+}
+
+/// Quantile of ascending values, linear between them; 0 of none.
+fn quantile(sorted: &[f64], q: f64) -> f64 {
+    let Some(last) = sorted.len().checked_sub(1) else {
+        return 0.0;
+    };
+    let at = q * last as f64;
+    let below = at.floor() as usize;
+    let above = (below + 1).min(last);
+    sorted[below] + (at - below as f64) * (sorted[above] - sorted[below])
+}
+
+/// Values at faces `(m, dim)` become half themselves and half the mean of their neighbours, `rounds`
+/// times. Bridges do not count: a component keeps what is its own.
+fn smooth(dual: &DualGraph, values: &mut [f64], dim: usize, rounds: usize) {
+    let mut sum = vec![0.0; dim];
+    for _ in 0..rounds {
+        let before = values.to_vec();
+        for f in 0..dual.n_faces() {
+            sum.fill(0.0);
+            let mut count = 0;
+            for &(g, edge) in dual.neighbors(f) {
+                if dual.edges[edge as usize].bridge {
+                    continue;
+                }
+                let row = &before[g as usize * dim..(g as usize + 1) * dim];
+                for (s, x) in sum.iter_mut().zip(row) {
+                    *s += x;
+                }
+                count += 1;
+            }
+            if count > 0 {
+                let share = 0.5 / f64::from(count);
+                for (x, s) in values[f * dim..(f + 1) * dim].iter_mut().zip(&sum) {
+                    *x = 0.5 * *x + share * s;
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

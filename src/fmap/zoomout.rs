@@ -166,7 +166,7 @@ mod tests {
         let angle = |v: usize| 2.0 * std::f32::consts::PI * order[v] as f32 / n as f32;
         let phi = (0..n)
             .flat_map(|v| {
-                (0..k).map(move |j| match j {
+                (0..k).map(move |j: usize| match j {
                     0 => 1.0,
                     j if j % 2 == 1 => 2f32.sqrt() * (angle(v) * j.div_ceil(2) as f32).cos(),
                     j => 2f32.sqrt() * (angle(v) * (j / 2) as f32).sin(),

@@ -128,16 +128,14 @@ mod tests {
     use rand::{Rng, SeedableRng};
 
     fn random_surface(rng: &mut rand_pcg::Pcg64, m: usize) -> Surface {
-        let edges = (0..2 * m)
-            .map(|_| (rng.random_range(0..m as u32), rng.random_range(0..m as u32)))
-            .filter(|(a, b)| a != b)
-            .map(|(a, b)| SurfaceEdge {
-                faces: [a, b],
-                length: 1.0,
-                crease: 0.0,
-                boundary_cost: rng.random_range(0.0..1.5),
-            })
-            .collect();
+        let mut edges = Vec::new();
+        for _ in 0..2 * m {
+            let faces = [rng.random_range(0..m as u32), rng.random_range(0..m as u32)];
+            let boundary_cost = rng.random_range(0.0..1.5);
+            if faces[0] != faces[1] {
+                edges.push(SurfaceEdge { faces, length: 1.0, crease: 0.0, boundary_cost });
+            }
+        }
         Surface { area: vec![1.0 / m as f64; m], centroids: vec![[0.0; 3]; m], edges }
     }
 

@@ -8,6 +8,7 @@ use super::{
 };
 use crate::mesh::{CleanError, ParseError};
 use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, describe};
+use crate::spectrum::SpectrumError;
 use crate::store::{
     CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, RequestRow, ShapeRow, Tx,
 };
@@ -160,6 +161,9 @@ impl Library {
             *since = Instant::now();
         };
         let observed = |name: &str| {
+            if laps.borrow().0.last().is_some_and(|last| last.0 == name) {
+                return stage(name);
+            }
             lap();
             let mut running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
             running.insert((item.job, item.index), name.to_string());
@@ -381,6 +385,7 @@ fn refusal(error: &DescribeError) -> Failure {
         DescribeError::Clean(CleanError::AllDegenerate { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),
         DescribeError::Clean(_) => ("INVALID_ARGUMENT", "MESH"),
         DescribeError::Laplacian(_) => ("INVALID_ARGUMENT", "LAPLACIAN"),
+        DescribeError::Spectrum(SpectrumError::Cancelled { .. }) => ("CANCELLED", "CANCELLED"),
         DescribeError::Spectrum(_) => ("INTERNAL", "SPECTRUM"),
         DescribeError::Cancelled(_) => ("CANCELLED", "CANCELLED"),
     };

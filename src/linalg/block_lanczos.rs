@@ -5,6 +5,9 @@
 //! every inner loop is a matrix product (Golub and Underwood 1977; Grimes, Lewis and Simon, *A
 //! Shifted Block Lanczos Algorithm*, 1994).
 
+// Small matrices and register tiles read best with their indices.
+#![allow(clippy::needless_range_loop)]
+
 use super::dense_eigen::{DenseEigenError, symmetric_eigen};
 use super::panel::{
     Basis, Row, Tile, WIDTH, ZERO_TILE, gram, multiply_in_place, tile_product, zero_panel,

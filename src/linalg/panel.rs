@@ -8,8 +8,13 @@
 //! Reductions over rows are cut into at most [`SLABS`] slabs whose bounds depend on `n` alone and
 //! are added up in order: the same bits come out for any number of threads.
 
+// Small matrices and register tiles read best with their indices.
+#![allow(clippy::needless_range_loop)]
+
 use pulp::{Arch, Simd, WithSimd};
-use rayon::prelude::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::prelude::{
+    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefMutIterator, ParallelIterator,
+};
 use rayon::slice::ParallelSliceMut;
 
 /// Columns of a panel.
@@ -21,6 +26,9 @@ pub const CHUNK: usize = 96;
 
 /// Independent partial sums of a reduction over rows.
 const SLABS: usize = 8;
+
+/// Chunks that threads share out between them at a time.
+const BATCH: usize = 16;
 
 /// One row of a panel.
 #[repr(C, align(64))]
@@ -92,32 +100,35 @@ impl Basis {
         let arch = Arch::new();
         let per_slab = self.chunks.len().div_ceil(SLABS).max(1);
         let n_tiles = self.n_panels - first;
-        let mut parts: Vec<Vec<Tile>> =
-            vec![vec![ZERO_TILE; n_tiles]; self.chunks.len().div_ceil(per_slab)];
-        let slab = |s: usize, tiles: &mut Vec<Tile>| {
+        let n_slabs = self.chunks.len().div_ceil(per_slab);
+        let slab = |s: usize| {
+            let mut tiles = vec![ZERO_TILE; n_tiles];
             let begin = s * per_slab;
             let end = (begin + per_slab).min(self.chunks.len());
             for c in begin..end {
                 let v = &self.chunks[c][first * CHUNK..self.n_panels * CHUNK];
+                let w = &panel[c * CHUNK..(c + 1) * CHUNK];
                 arch.dispatch(Project {
                     v,
-                    w: &panel[c * CHUNK..(c + 1) * CHUNK],
-                    tiles,
+                    w,
+                    tiles: &mut tiles,
                 });
+            }
+            tiles
+        };
+        let mut total = vec![ZERO_TILE; n_tiles];
+        let mut add = |part: Vec<Tile>| {
+            for (t, p) in total.iter_mut().zip(&part) {
+                add_tile(t, p);
             }
         };
         if self.parallel {
-            parts
-                .par_iter_mut()
-                .enumerate()
-                .for_each(|(s, tiles)| slab(s, tiles));
+            let parts: Vec<Vec<Tile>> = (0..n_slabs).into_par_iter().map(slab).collect();
+            parts.into_iter().for_each(add);
         } else {
-            parts
-                .iter_mut()
-                .enumerate()
-                .for_each(|(s, tiles)| slab(s, tiles));
+            (0..n_slabs).for_each(|s| add(slab(s)));
         }
-        sum_in_order(parts, n_tiles)
+        total
     }
 
     /// `W += Σ_j V_j C_j` over the panels `j >= first`; `tiles` holds the `C_j`.
@@ -146,10 +157,13 @@ impl Basis {
     pub fn combinations(&self, coefficients: &[Vec<Tile>]) -> Vec<Vec<Row>> {
         let arch = Arch::new();
         let n_out = coefficients.len();
-        let mut by_chunk: Vec<Vec<Row>> = vec![Vec::new(); self.chunks.len()];
-        let body = |(out, v): (&mut Vec<Row>, &Vec<Row>)| {
-            out.resize(n_out * CHUNK, Row::ZERO);
-            for (tiles, w) in coefficients.iter().zip(out.chunks_exact_mut(CHUNK)) {
+        let n_rows = self.chunks.len() * CHUNK;
+        let mut out: Vec<Vec<Row>> = (0..n_out).map(|_| Vec::with_capacity(n_rows)).collect();
+        let mut scratch =
+            vec![vec![Row::ZERO; n_out * CHUNK]; if self.parallel { BATCH } else { 1 }];
+        let body = |(x, v): (&mut Vec<Row>, &Vec<Row>)| {
+            x.fill(Row::ZERO);
+            for (tiles, w) in coefficients.iter().zip(x.chunks_exact_mut(CHUNK)) {
                 arch.dispatch(AddCombination {
                     v: &v[..self.n_panels * CHUNK],
                     tiles,
@@ -157,38 +171,28 @@ impl Basis {
                 });
             }
         };
-        if self.parallel {
-            by_chunk.par_iter_mut().zip(&self.chunks).for_each(body);
-        } else {
-            by_chunk.iter_mut().zip(&self.chunks).for_each(body);
-        }
-        (0..n_out)
-            .map(|p| {
-                let mut panel = Vec::with_capacity(self.chunks.len() * CHUNK);
-                for chunk in &by_chunk {
-                    panel.extend_from_slice(&chunk[p * CHUNK..(p + 1) * CHUNK]);
-                }
-                panel
-            })
-            .collect()
-    }
-}
-
-fn sum_in_order(mut parts: Vec<Vec<Tile>>, n_tiles: usize) -> Vec<Tile> {
-    if parts.is_empty() {
-        return vec![ZERO_TILE; n_tiles];
-    }
-    let mut total = parts.remove(0);
-    for part in &parts {
-        for (t, p) in total.iter_mut().zip(part) {
-            for (tr, pr) in t.iter_mut().zip(p) {
-                for (x, y) in tr.0.iter_mut().zip(&pr.0) {
-                    *x += y;
+        for batch in self.chunks.chunks(scratch.len()) {
+            if self.parallel {
+                scratch.par_iter_mut().zip(batch).for_each(body);
+            } else {
+                scratch.iter_mut().zip(batch).for_each(body);
+            }
+            for x in &scratch[..batch.len()] {
+                for (panel, rows) in out.iter_mut().zip(x.chunks_exact(CHUNK)) {
+                    panel.extend_from_slice(rows);
                 }
             }
         }
+        out
     }
-    total
+}
+
+fn add_tile(total: &mut Tile, part: &Tile) {
+    for (t, p) in total.iter_mut().zip(part) {
+        for (x, y) in t.0.iter_mut().zip(&p.0) {
+            *x += y;
+        }
+    }
 }
 
 /// `-C`.
@@ -223,11 +227,7 @@ pub fn gram(v: &[Row], w: &[Row]) -> Tile {
                 tiles: &mut part,
             });
         }
-        for (t, p) in total.iter_mut().zip(&part[0]) {
-            for (x, y) in t.0.iter_mut().zip(&p.0) {
-                *x += y;
-            }
-        }
+        add_tile(&mut total, &part[0]);
     }
     total
 }
@@ -252,6 +252,9 @@ pub fn multiply_in_place(panel: &mut [Row], tile: &Tile) {
 /// loads and a broadcast fit into 16 registers and hide the latency of the multiply-add.
 const HELD: usize = 6;
 
+/// Rows that a projection takes before the next columns of the same rows: a divisor of [`CHUNK`].
+const BURST: usize = 24;
+
 struct Project<'a> {
     v: &'a [Row],
     w: &'a [Row],
@@ -264,10 +267,13 @@ impl WithSimd for Project<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         for (v, tile) in self.v.chunks_exact(CHUNK).zip(self.tiles) {
-            for h in 0..WIDTH / (2 * S::F64_LANES) {
-                project_columns::<S, 0, HELD>(simd, v, self.w, h, tile);
-                project_columns::<S, 6, 5>(simd, v, self.w, h, tile);
-                project_columns::<S, 11, 5>(simd, v, self.w, h, tile);
+            // Few rows at a time, so that the stream from memory is spread over all passes.
+            for (v, w) in v.chunks_exact(BURST).zip(self.w.chunks_exact(BURST)) {
+                for h in 0..WIDTH / (2 * S::F64_LANES) {
+                    project_columns::<S, 0, HELD>(simd, v, w, h, tile);
+                    project_columns::<S, 6, 5>(simd, v, w, h, tile);
+                    project_columns::<S, 11, 5>(simd, v, w, h, tile);
+                }
             }
         }
     }
@@ -311,10 +317,10 @@ impl WithSimd for AddCombination<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         for (v, tile) in self.v.chunks_exact(CHUNK).zip(self.tiles) {
-            for h in 0..WIDTH / (2 * S::F64_LANES) {
-                let (v_groups, _) = v.as_chunks::<HELD>();
-                let (w_groups, _) = self.w.as_chunks_mut::<HELD>();
-                for (vg, wg) in v_groups.iter().zip(w_groups) {
+            let (v_groups, _) = v.as_chunks::<HELD>();
+            let (w_groups, _) = self.w.as_chunks_mut::<HELD>();
+            for (vg, wg) in v_groups.iter().zip(w_groups) {
+                for h in 0..WIDTH / (2 * S::F64_LANES) {
                     add_rows(simd, vg, tile, h, wg);
                 }
             }

@@ -136,8 +136,9 @@ impl Tree {
                 continue;
             }
             if node.left == 0 {
-                for i in node.start..node.end {
-                    let d = distance(self.points[i].position, position);
+                let points = self.points[node.start..node.end].iter();
+                for (i, point) in (node.start..).zip(points) {
+                    let d = distance(point.position, position);
                     if wanted(set[i]) && d <= limit && best.is_none_or(|b| (d, i) < b) {
                         best = Some((d, i));
                     }

@@ -319,12 +319,9 @@ impl Bvh {
 
 #[inline]
 fn box_distance(node: &Node, p: [f64; 3]) -> f64 {
-    let mut sum = 0.0;
-    for i in 0..3 {
-        let d = (node.low[i] - p[i]).max(p[i] - node.high[i]).max(0.0);
-        sum += d * d;
-    }
-    sum.sqrt()
+    let d: [f64; 3] =
+        std::array::from_fn(|i| (node.low[i] - p[i]).max(p[i] - node.high[i]).max(0.0));
+    dot(d, d).sqrt()
 }
 
 /// Where a ray enters a box; infinite when it misses it or enters beyond `limit`.

@@ -9,7 +9,6 @@ mod bridges;
 mod bvh;
 mod clean;
 pub mod geodesic;
-
 mod orient;
 mod parse;
 mod proxy;

@@ -35,3 +35,24 @@ counts!(
     n_proxy_vertices,
     n_bridges,
 );
+
+#[cfg(test)]
+mod tests {
+    use super::CleanReport;
+    use std::collections::BTreeMap;
+
+    #[test]
+    fn counts_come_back_by_name_and_a_missing_one_is_an_error() {
+        let report = CleanReport {
+            n_triangles: 7,
+            n_bridges: 3,
+            ..CleanReport::default()
+        };
+        let mut counts: BTreeMap<&str, usize> = report.counts().into_iter().collect();
+        let back = CleanReport::from_counts(|name| counts.get(name).copied().ok_or(name));
+        assert_eq!(back, Ok(report));
+        counts.remove("n_bridges");
+        let back = CleanReport::from_counts(|name| counts.get(name).copied().ok_or(name));
+        assert_eq!(back, Err("n_bridges"));
+    }
+}

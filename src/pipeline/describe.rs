@@ -121,13 +121,18 @@ pub fn spectrum_of(
     if !stage("spectrum") {
         return Err(DescribeError::Cancelled("spectrum"));
     }
+    // The solver's own stages only ask whether to go on.
+    let go_on = |_: &str| stage("spectrum");
     let options = spectrum::Options {
-        // Stages within the solver are told as they come, but time is kept by ours.
-        stage: None,
+        stage: Some(&go_on),
+        threads: params.threads as usize,
         ..spectrum::Options::default()
     };
     let n = mesh.vertices.len();
-    let k = (params.n_eigenpairs as usize).min(n / 4).max(MIN_EIGENPAIRS.min(n));
+    let mut k = params.n_eigenpairs as usize;
+    if params.only_meaningful {
+        k = k.min(n / 4).max(MIN_EIGENPAIRS.min(n));
+    }
     let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)?;
     Ok(MeshSpectrum { spectrum, mass: operator.mass })
 }

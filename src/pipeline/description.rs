@@ -10,13 +10,18 @@ pub struct Params {
     pub operator: Operator,
     /// Faces of the working-resolution proxy.
     pub working_faces: u32,
-    /// Eigenpairs asked for; fewer on small meshes (at most a quarter of the vertices).
+    /// Eigenpairs asked for.
     pub n_eigenpairs: u32,
+    /// Whether a mesh may have fewer: at most a quarter of its vertices, beyond which eigenvalues say more of the
+    /// triangles than of the surface.
+    pub only_meaningful: bool,
+    /// Threads for the spectrum; the result does not depend on it.
+    pub threads: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { operator: Operator::default(), working_faces: 2_500, n_eigenpairs: 300 }
+        Self { operator: Operator::default(), working_faces: 2_500, n_eigenpairs: 300, only_meaningful: true, threads: 1 }
     }
 }
 

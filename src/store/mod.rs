@@ -32,15 +32,17 @@ pub mod mapped;
 pub mod objects;
 pub mod rows;
 
+pub use array_file::write_description;
 pub use catalog::{Catalog, Reader, Tx};
 pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
 pub use health::Health;
-pub use objects::Objects;
 pub use mapped::MappedDescription;
+pub use objects::Objects;
 pub use rows::{
-    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow, MapRow,
-    NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId, ShapeRow,
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow,
+    MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId,
+    ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

@@ -91,7 +91,7 @@ mod tests {
         assert_eq!(first, FIRST);
     }
 
-    const FIRST: [u64; 3] = [0, 0, 0];
+    const FIRST: [u64; 3] = [52_147_413, 878_678_247, 928_749_997];
 
     #[test]
     fn is_uniform_and_differs_by_index() {

@@ -198,8 +198,8 @@ fn mesh_of(scene: &Scene, n_faces: usize) -> TriMesh {
     let mut mesh = extract(cell);
     let area: f64 = mesh.faces.iter().map(|f| face_area(&mesh, f)).sum();
     let edge = (area / n_faces as f64 * 4.0 / 3f64.sqrt()).sqrt();
-    if cell > 0.6 * edge {
-        mesh = extract(0.6 * edge);
+    if cell > 0.7 * edge {
+        mesh = extract(0.7 * edge);
     }
     remesh::remesh(mesh, scene, n_faces)
 }

@@ -9,8 +9,8 @@ use super::field::Scene;
 use super::vector::{Vec3, along, cross, dot, mix, norm, sub, unit};
 use crate::mesh::TriMesh;
 
-/// Rounds of split, collapse, flip and smooth; the shape of triangles no longer changes after about five.
-const N_ROUNDS: usize = 5;
+/// Rounds of split, collapse, flip and smooth; the shape of triangles no longer changes after about four.
+const N_ROUNDS: usize = 4;
 /// Rounds after the number of faces is reached.
 const N_FINAL_ROUNDS: usize = 3;
 /// Least cosine between a face before and after a step.
@@ -20,6 +20,9 @@ const LEAST_COSINE: f64 = 0.3;
 const LEAST_GAP: f64 = 0.02;
 /// Aligning makes no angle smaller than that of this sine, 22°.
 const LEAST_SINE: f64 = 0.375;
+
+/// Step of difference quotients, in edge lengths.
+const STEP: f64 = 1e-3;
 
 struct Mesh<'a> {
     scene: &'a Scene,
@@ -163,8 +166,8 @@ impl Mesh<'_> {
             return;
         };
         let m = self.vertices.len() as u32;
-        self.vertices
-            .push(self.onto_surface(mix(self.at(a), self.at(b), 0.5)));
+        // Smoothing, which follows, brings it onto the surface.
+        self.vertices.push(mix(self.at(a), self.at(b), 0.5));
         self.around.push(Vec::with_capacity(6));
         for ((f, c), (from, to)) in faces.into_iter().zip(thirds).zip([(a, b), (b, a)]) {
             let new = self.faces.len() as u32;
@@ -202,7 +205,7 @@ impl Mesh<'_> {
         if shared != 2 || too_small {
             return;
         }
-        let middle = self.onto_surface(mix(self.at(a), self.at(b), 0.5));
+        let middle = mix(self.at(a), self.at(b), 0.5);
         let reach = 4.0 / 3.0 * self.target;
         let all_near = near_a.iter().chain(&near_b).filter(|&&v| v != a && v != b);
         if all_near
@@ -286,7 +289,7 @@ impl Mesh<'_> {
             let sliver = new.iter().any(|face| self.least_sine(face) < LEAST_SINE);
             let outward = |n: Vec3, face: &[u32; 3]| {
                 face.iter().all(|&v| {
-                    let g = self.scene.gradient(self.at(v), 1e-3 * self.target);
+                    let g = self.scene.gradient(self.at(v), STEP * self.target);
                     dot(n, g) > 0.0
                 })
             };
@@ -337,9 +340,10 @@ impl Mesh<'_> {
                 .iter()
                 .fold([0.0; 3], |s, &u| along(s, self.at(u), 1.0));
             let pull = sub(sum.map(|x| x / near.len() as f64), here);
-            let normal = unit(self.scene.gradient(here, 1e-3 * self.target));
+            let gradient = self.scene.gradient(here, STEP * self.target);
+            let normal = unit(gradient);
             let tangential = along(pull, normal, -dot(pull, normal));
-            let there = self.onto_surface(along(here, tangential, 0.7));
+            let there = self.onto_surface(along(here, tangential, 0.7), gradient);
             let facing = |m: &Self| {
                 let faces = m.around[v as usize].iter().map(|&f| &m.faces[f as usize]);
                 faces
@@ -354,14 +358,17 @@ impl Mesh<'_> {
         }
     }
 
-    /// The zero set near `p`, by Newton steps along the gradient, none longer than half an edge.
-    fn onto_surface(&self, mut p: Vec3) -> Vec3 {
-        for _ in 0..4 {
+    /// The zero set near `p`, by Newton steps along the gradient, none longer than half an edge. `g` is a
+    /// gradient from nearby, good enough for the first step.
+    fn onto_surface(&self, mut p: Vec3, mut g: Vec3) -> Vec3 {
+        for i in 0..4 {
             let value = self.scene.value(p);
-            if value.abs() < 1e-4 * self.target {
+            if value.abs() < 1e-3 * self.target {
                 break;
             }
-            let g = self.scene.gradient(p, 1e-3 * self.target);
+            if i > 0 {
+                g = self.scene.gradient(p, STEP * self.target);
+            }
             // Where the gradient all but vanishes (between two parts), its direction says nothing.
             let slope2 = dot(g, g).max(0.1);
             let limit = 0.5 * self.target / slope2.sqrt();

@@ -33,11 +33,14 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
 
     // Legs: the pairs stride against each other.
     let thick = dice.between(0.8, 1.25);
-    let stride = dice.between(-24.0, 24.0);
+    // Degrees; on a short body long legs must not stride into each other.
+    let stride = dice.between(-1.0, 1.0) * (14.0 * length / leg).min(24.0);
     for (end, hip_radius, is_front) in [(rear, hips, false), (front, chest, true)] {
         for side in [-1.0, 1.0] {
             let swing = stride * side * if is_front { 1.0 } else { -1.0 } + dice.between(-6.0, 6.0);
-            let hip = [side * hip_radius * 0.62, end[1] - 0.15 * hip_radius, end[2]];
+            // Thighs must not meet under a narrow body.
+            let apart = (0.62 * hip_radius).max(0.02 + thigh(thick, is_front));
+            let hip = [side * apart, end[1] - 0.15 * hip_radius, end[2]];
             let bend = dice.between(4.0, 28.0) * if is_front { 1.0 } else { -1.0 };
             legs(&mut scene, hip, leg, swing, bend, thick, is_front);
         }
@@ -120,6 +123,11 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     scene
 }
 
+/// Radius of a leg where it leaves the body.
+fn thigh(thick: f64, is_front: bool) -> f64 {
+    if is_front { 0.085 * thick } else { 0.1 * thick }
+}
+
 /// One leg, down to y = 0 for a straight one.
 fn legs(scene: &mut Scene, hip: Vec3, leg: f64, swing: f64, bend: f64, thick: f64, is_front: bool) {
     let down = [0.0, -1.0, 0.0];
@@ -134,10 +142,9 @@ fn legs(scene: &mut Scene, hip: Vec3, leg: f64, swing: f64, bend: f64, thick: f6
         unit([0.0, -0.1, 1.0]),
         0.07 + 0.02 * leg,
     );
-    let thigh = if is_front { 0.085 } else { 0.1 } * thick;
     scene
         .limb(0.05, 0.03)
-        .cone(LEG, hip, knee, thigh, 0.055 * thick)
+        .cone(LEG, hip, knee, thigh(thick, is_front), 0.055 * thick)
         .cone(LEG, knee, ankle, 0.055 * thick, 0.044 * thick)
         .cone(LEG, ankle, toe, 0.046 * thick, 0.04 * thick);
 }

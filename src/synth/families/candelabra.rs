@@ -79,7 +79,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     if n_candles % 2 == 1 {
         candle(
             scene.limb(0.015, 0.01),
-            [0.0, high + rise.max(0.0) + 0.02, 0.0],
+            [0.0, high + 0.02, 0.0],
             cup,
             wax,
             long,

@@ -2,7 +2,7 @@
 
 use crate::synth::dice::Dice;
 use crate::synth::field::{Scene, Solid};
-use crate::synth::vector::{Frame, Vec3, along, closed_curve, mix, norm, turn};
+use crate::synth::vector::{Frame, Vec3, along, closed_curve, mix, norm, sub, turn};
 
 pub(in crate::synth) const LABELS: &[&str] = &["seat", "back", "leg", "arm"];
 const SEAT: u32 = 0;
@@ -20,6 +20,8 @@ struct Plan {
     rod: f64,
     /// How far inside the seat's edges the legs must be to be under it.
     inset: f64,
+    /// Half width and rear edge of what a back can stand on.
+    rear: [f64; 2],
 }
 
 impl Plan {
@@ -32,15 +34,21 @@ impl Plan {
 pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let mut scene = Scene::default();
     let round = dice.chance(0.33);
+    let seat = [
+        dice.between(0.21, 0.29),
+        dice.between(0.033, 0.055),
+        dice.between(0.2, 0.26),
+    ];
     let plan = Plan {
         height: dice.between(0.38, 0.5),
-        seat: [
-            dice.between(0.21, 0.29),
-            dice.between(0.033, 0.055),
-            dice.between(0.2, 0.26),
-        ],
+        seat,
         rod: dice.between(0.03, 0.038),
         inset: if round { 0.095 } else { 0.06 },
+        rear: if round {
+            [0.8 * seat[0], 0.06 - seat[2]]
+        } else {
+            [seat[0], 0.035 - seat[2]]
+        },
     };
     let [width, thick, depth] = plan.seat;
     let centre = Frame::at([0.0, plan.height, 0.0]);
@@ -62,14 +70,14 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         limb.block(SEAT, centre, [width, thick, depth], 0.03);
     }
     let arms = dice.chance(0.45);
-    back(&mut scene, dice, &plan);
+    let back = back(&mut scene, dice, &plan);
     match dice.pick(5) {
         0 => pedestal(&mut scene, dice, &plan),
         1 => runners(&mut scene, dice, &plan),
         _ => four_legs(&mut scene, dice, &plan),
     }
     if arms {
-        arm_rests(&mut scene, dice, &plan);
+        arm_rests(&mut scene, dice, &plan, &back);
     }
     scene
 }
@@ -90,13 +98,13 @@ fn rounded(x: f64, y: f64) -> Vec<[f64; 2]> {
     closed_curve(&points, 4)
 }
 
-fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
-    let [width, thick, depth] = plan.seat;
+/// The frame of the back: x across, y up along it, z forward, the origin on the seat.
+fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) -> Frame {
+    let [width, edge] = plan.rear;
     let tall = dice.between(0.38, 0.62);
     let lean = dice.between(2.0, 16.0);
     let inset = width - plan.rod;
-    // x across, y up along the back, z forward; the origin is on the seat's rear edge.
-    let foot = [0.0, plan.height + 0.3 * thick, -depth + 0.035];
+    let foot = [0.0, plan.height + 0.3 * plan.seat[1], edge];
     let up = turn([0.0, 1.0, 0.0], [0.0, 0.0, -1.0], lean);
     let frame = Frame::facing(foot, up, [0.0, 0.0, 1.0]);
     let at = |x: f64, y: f64| frame.world([x, y, 0.0]);
@@ -105,7 +113,7 @@ fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
     if kind == 0 {
         // A panel that starts at the seat; its top is level or an arc.
         let arc = dice.between(0.0, 0.1);
-        let w = width * dice.between(0.85, 1.0) - 0.03;
+        let w = width * dice.between(0.92, 1.0) - 0.03;
         let top = tall - 0.03;
         let outline = vec![
             [-w, 0.0],
@@ -128,7 +136,7 @@ fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
                 round: 0.03,
             },
         );
-        return;
+        return frame;
     }
     let limb = scene.limb(0.02, 0.015);
     for side in [-1.0, 1.0] {
@@ -142,8 +150,8 @@ fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
     }
     match kind {
         1 => {
-            // Bars between two rails.
-            let n = 2 + dice.pick(3);
+            // Bars between two rails, as many as leave gaps of more than their own width.
+            let n = (2 + dice.pick(3)).min((2.0 * inset / 0.09) as usize - 1);
             let low = dice.between(0.08, 0.16);
             limb.cone(
                 BACK,
@@ -190,6 +198,7 @@ fn back(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
             );
         }
     }
+    frame
 }
 
 fn four_legs(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
@@ -299,46 +308,39 @@ fn runners(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
     }
 }
 
-fn arm_rests(scene: &mut Scene, dice: &mut Dice, plan: &Plan) {
+fn arm_rests(scene: &mut Scene, dice: &mut Dice, plan: &Plan, back: &Frame) {
     let [width, _, depth] = plan.seat;
     let high = plan.height + dice.between(0.17, 0.25);
-    let reach = depth * dice.between(0.55, 0.95);
+    let reach = depth * dice.between(0.45, 0.8);
     let board = dice.chance(0.5);
     let drop = dice.between(0.0, 0.03);
     let solid = dice.chance(0.25);
     for side in [-1.0, 1.0] {
-        let x = side * (width + 0.005);
+        // The rest ends in the back, wherever that is at this height.
+        let rise = (high + drop - back.origin[1]) / back.axes[1][1];
+        let rear = back.world([side * (plan.rear[0] - plan.rod), rise, 0.0]);
+        let front = [side * (width + 0.005), high, reach];
         let limb = scene.limb(0.015, 0.015);
+        let ahead = sub(front, rear);
+        let frame = Frame::facing(mix(rear, front, 0.5), ahead, [0.0, 1.0, 0.0]);
+        let half = norm(ahead) / 2.0;
         if solid {
             // A side panel from seat to arm rest.
-            let middle = (plan.height + high) / 2.0;
-            let frame = Frame::at([x, middle, (reach - depth) / 2.0]);
-            limb.block(
-                ARM,
-                frame,
-                [0.036, (high - plan.height) / 2.0, (reach + depth) / 2.0],
-                0.03,
-            );
+            let deep = (high - plan.height) / 2.0;
+            let middle = Frame {
+                origin: along(frame.origin, frame.axes[2], 0.03 - deep),
+                ..frame
+            };
+            limb.block(ARM, middle, [0.036, half, deep], 0.03);
             continue;
         }
-        // The rest ends inside the back, however far that leans.
-        let rear = [x - side * 0.02, high + drop, -depth - 0.02];
-        let front = [x, high, reach];
         if board {
-            let ahead = [front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]];
-            let frame = Frame::facing(mix(rear, front, 0.5), ahead, [0.0, 1.0, 0.0]);
-            let half = norm(ahead) / 2.0;
             limb.block(ARM, frame, [0.044, half + 0.03, 0.028], 0.026);
         } else {
             limb.cone(ARM, rear, front, 0.033, 0.033);
         }
-        let seat = [side * (width - 0.02), plan.height, 0.75 * reach];
-        limb.cone(
-            ARM,
-            along(front, [0.0, 0.0, -1.0], 0.2 * reach),
-            seat,
-            0.029,
-            0.029,
-        );
+        let post = along(front, [0.0, 0.0, -1.0], 0.2 * reach);
+        let seat = [side * (width - 0.03), plan.height, 0.5 * reach];
+        limb.cone(ARM, post, seat, 0.029, 0.029);
     }
 }

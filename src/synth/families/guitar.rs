@@ -154,9 +154,9 @@ fn horned(dice: &mut Dice, length: f64) -> Vec<[f64; 2]> {
     let h = length / 2.0;
     // One horn, or two of unequal length.
     let tips = [
-        dice.between(1.15, 1.5),
+        dice.between(1.05, 1.3),
         if dice.chance(0.6) {
-            dice.between(1.0, 1.25)
+            dice.between(0.96, 1.15)
         } else {
             0.55
         },
@@ -170,11 +170,12 @@ fn horned(dice: &mut Dice, length: f64) -> Vec<[f64; 2]> {
         ];
         if tip > 0.9 {
             points.extend([
-                [1.12 * waist, 0.6],
-                [1.16 * waist, tip - 0.12],
+                [1.08 * waist, 0.55],
+                [1.14 * waist, tip - 0.15],
                 [0.98 * waist, tip],
-                [0.72 * waist, 0.82],
-                [0.3, 0.62],
+                [0.74 * waist, tip - 0.1],
+                [0.52 * waist, 0.76],
+                [0.28, 0.66],
             ]);
         } else {
             points.extend([[0.96 * waist, 0.5], [0.6 * waist, 0.68]]);

@@ -1,0 +1,266 @@
+//! Eigenpairs of the Laplacian become descriptors of points (heat and wave kernel signatures, global
+//! point signature) and of the shape (ShapeDNA).
+//!
+//! Sun, Ovsjanikov and Guibas 2009, *A Concise and Provably Informative Multi-Scale Signature Based on
+//! Heat Diffusion*; Aubry, Schlickewei and Cremers 2011, *The Wave Kernel Signature*; Rustamov 2007,
+//! *Laplace-Beltrami Eigenfunctions for Deformation Invariant Shape Representation*; Reuter, Wolter and
+//! Peinecke 2006, *Laplace-Beltrami Spectra as Shape-DNA*. Sums of squares of eigenvectors depend
+//! neither on their signs nor on the basis of an eigenspace.
+
+use nalgebra::DMatrix;
+
+/// Eigenvalues up to this fraction of the largest one given are zero: solvers leave about 1e-10.
+const ZERO: f64 = 1e-7;
+/// The smallest eigenvalue that sets a time, for a mesh of area 1: a time above it sees nothing but a
+/// constant.
+const MIN_EIGENVALUE: f64 = 1e-3;
+/// Width of the wave kernel's energy bands, in percent of the range of energies, from the paper.
+const WAVE_WIDTH: f64 = 0.07;
+
+/// Number of eigenvalues (ascending) that are zero: one for each component of the domain.
+pub fn null_space(eigenvalues: &[f64]) -> usize {
+    let zero = eigenvalues.last().map_or(0.0, |last| ZERO * last.max(0.0));
+    eigenvalues.iter().take_while(|&&x| x <= zero).count()
+}
+
+/// `n_times` times `(n_times,)`, log-uniform from `4 ln 10 / λ_last` to `4 ln 10 / λ₂`, where λ₂ is the
+/// first eigenvalue above the null space. All 1 when there is none.
+pub fn hks_times(eigenvalues: &[f64], n_times: usize) -> Vec<f64> {
+    let Some((second, last)) = ends(eigenvalues) else {
+        return vec![1.0; n_times];
+    };
+    let (from, to) = (
+        4.0 * std::f64::consts::LN_10 / last,
+        4.0 * std::f64::consts::LN_10 / second,
+    );
+    let steps = n_times.saturating_sub(1).max(1) as f64;
+    (0..n_times)
+        .map(|j| from * (to / from).powf(j as f64 / steps))
+        .collect()
+}
+
+/// The first eigenvalue above the null space and the last.
+fn ends(eigenvalues: &[f64]) -> Option<(f64, f64)> {
+    let first = *eigenvalues.get(null_space(eigenvalues))?;
+    eigenvalues.last().map(|&last| (first, last))
+}
+
+/// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs there are
+/// both a value `(k,)` and a vector `(n, k)` of. Unit: 1 / area. O(n k times), as one matrix product.
+pub fn hks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, times: &[f64]) -> Vec<f32> {
+    let k = eigenvalues.len().min(eigenvectors.ncols());
+    let heat = DMatrix::from_fn(k, times.len(), |i, j| (-eigenvalues[i] * times[j]).exp());
+    to_single(&weighted_squares(eigenvectors, &heat))
+}
+
+/// Wave kernel signature `(n, n_energies)`, row-major: for energies uniform in log λ from the first
+/// eigenvalue above the null space to the last, the mean of `φ_i(x)²` under a Gaussian about the
+/// energy. Zero when no eigenvalue is above the null space.
+pub fn wks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, n_energies: usize) -> Vec<f32> {
+    let k = eigenvalues.len().min(eigenvectors.ncols());
+    to_single(&weighted_squares(
+        eigenvectors,
+        &wave_weights(&eigenvalues[..k], n_energies),
+    ))
+}
+
+/// Global point signature `(n, dims)`, row-major: `φ_i(x) / √λ_i` for the first `dims` eigenvalues above
+/// the null space; zero beyond the last. Signs are those of the eigenvectors.
+pub fn gps(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, dims: usize) -> Vec<f32> {
+    let k = eigenvalues.len().min(eigenvectors.ncols());
+    let skip = null_space(&eigenvalues[..k]);
+    let mut result = Vec::with_capacity(eigenvectors.nrows() * dims);
+    for v in 0..eigenvectors.nrows() {
+        result.extend((skip..skip + dims).map(|i| {
+            if i < k {
+                (eigenvectors[(v, i)] / eigenvalues[i].sqrt()) as f32
+            } else {
+                0.0
+            }
+        }));
+    }
+    result
+}
+
+/// ShapeDNA `(n,)`: logarithms of the first `n` eigenvalues above the null space, for a mesh of area 1.
+/// Where there are fewer the last one is repeated; 0 when there is none.
+pub fn shape_dna(eigenvalues: &[f64], n: usize) -> Vec<f32> {
+    let above = &eigenvalues[null_space(eigenvalues)..];
+    let at = |i: usize| above.get(i).or(above.last()).map_or(0.0, |x| x.ln() as f32);
+    (0..n).map(at).collect()
+}
+
+/// Heat kernel signature over the heat trace at `n_times` times, then wave kernel signature at
+/// `n_energies` energies, `(n, n_times + n_energies)` row-major.
+pub(super) fn kernels(
+    eigenvalues: &[f64],
+    eigenvectors: &DMatrix<f64>,
+    n_times: usize,
+    n_energies: usize,
+) -> Vec<f64> {
+    let k = eigenvalues.len();
+    let mut weights = DMatrix::zeros(k, n_times + n_energies);
+    if let Some((second, last)) = ends(eigenvalues) {
+        let from = 4.0 * std::f64::consts::LN_10 / last;
+        let ratio = last / second.max(MIN_EIGENVALUE).min(last);
+        let steps = (n_times - 1).max(1) as f64;
+        for j in 0..n_times {
+            let time = from * ratio.powf(j as f64 / steps);
+            let heat = |i: usize| (-eigenvalues[i].max(0.0) * time).exp();
+            let trace: f64 = (0..k).map(heat).sum();
+            for i in 0..k {
+                weights[(i, j)] = heat(i) / trace;
+            }
+        }
+    }
+    weights
+        .columns_mut(n_times, n_energies)
+        .copy_from(&wave_weights(eigenvalues, n_energies));
+    let product = weighted_squares(eigenvectors, &weights);
+    product.transpose().as_slice().to_vec()
+}
+
+/// Weight of each eigenpair at each energy `(k, n_energies)`; columns sum to 1.
+fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
+    let k = eigenvalues.len();
+    let skip = null_space(eigenvalues);
+    let mut weights = DMatrix::zeros(k, n_energies);
+    let logs: Vec<f64> = eigenvalues[skip..].iter().map(|x| x.ln()).collect();
+    let (Some(&low), Some(&high)) = (logs.first(), logs.last()) else {
+        return weights;
+    };
+    // With a single energy any width gives the same.
+    let width = (WAVE_WIDTH * (high - low)).max(f64::MIN_POSITIVE.sqrt());
+    let steps = n_energies.saturating_sub(1).max(1) as f64;
+    for j in 0..n_energies {
+        let energy = low + (high - low) * j as f64 / steps;
+        let exponent = |log: f64| -0.5 * ((energy - log) / width).powi(2);
+        // Relative to the nearest eigenvalue: in a gap wider than the bands all would vanish.
+        let most = logs
+            .iter()
+            .map(|&l| exponent(l))
+            .fold(f64::NEG_INFINITY, f64::max);
+        let total: f64 = logs.iter().map(|&l| (exponent(l) - most).exp()).sum();
+        for (i, &log) in logs.iter().enumerate() {
+            weights[(skip + i, j)] = (exponent(log) - most).exp() / total;
+        }
+    }
+    weights
+}
+
+/// `(φ²) weights`: `(n, k) (k, t) → (n, t)`.
+fn weighted_squares(eigenvectors: &DMatrix<f64>, weights: &DMatrix<f64>) -> DMatrix<f64> {
+    eigenvectors.columns(0, weights.nrows()).map(|x| x * x) * weights
+}
+
+/// Row-major, in single precision.
+fn to_single(values: &DMatrix<f64>) -> Vec<f32> {
+    values.transpose().iter().map(|&x| x as f32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{gps, hks, hks_times, kernels, null_space, shape_dna, wks};
+    use nalgebra::DMatrix;
+
+    /// A path of four points: eigenvalues 2 − 2 cos(πi/4), eigenvectors cosines.
+    fn path() -> (Vec<f64>, DMatrix<f64>) {
+        let angle = |i: usize| std::f64::consts::PI * i as f64 / 4.0;
+        let values = (0..4).map(|i| 2.0 - 2.0 * angle(i).cos()).collect();
+        let vectors = DMatrix::from_fn(4, 4, |v, i| {
+            let scale: f64 = if i == 0 { 0.5 } else { 0.5_f64.sqrt() };
+            scale * ((v as f64 + 0.5) * angle(i)).cos()
+        });
+        (values, vectors)
+    }
+
+    #[test]
+    fn times_run_from_the_last_eigenvalue_to_the_first_above_zero() {
+        let times = hks_times(&[-1e-12, 1e-11, 0.5, 2.0, 8.0], 100);
+        let c = 4.0 * 10.0_f64.ln();
+        assert_eq!(times.len(), 100);
+        assert!((times[0] - c / 8.0).abs() < 1e-12 && (times[99] - c / 0.5).abs() < 1e-9);
+        let ratio = times[1] / times[0];
+        assert!(
+            times
+                .windows(2)
+                .all(|w| (w[1] / w[0] - ratio).abs() < 1e-12)
+        );
+    }
+
+    #[test]
+    fn hks_is_the_diagonal_of_the_heat_operator() {
+        let (values, vectors) = path();
+        for t in [0.1, 1.0, 3.0] {
+            let heat = &vectors
+                * DMatrix::from_diagonal(&nalgebra::DVector::from_fn(4, |i, _| {
+                    (-values[i] * t).exp()
+                }))
+                * vectors.transpose();
+            let h = hks(&values, &vectors, &[t, 2.0 * t]);
+            for v in 0..4 {
+                assert!((f64::from(h[2 * v]) - heat[(v, v)]).abs() < 1e-6);
+            }
+        }
+        // At once all of the heat is where it was put, in the end it is everywhere the same.
+        let h = hks(&values, &vectors, &[0.0, 1e9]);
+        assert!(
+            h.chunks(2)
+                .all(|r| (r[0] - 1.0).abs() < 1e-6 && (r[1] - 0.25).abs() < 1e-6)
+        );
+    }
+
+    #[test]
+    fn kernels_are_weighted_means_of_squares() {
+        let (values, vectors) = path();
+        let n = 4;
+        let all = kernels(&values, &vectors, 3, 5);
+        // Squares of an orthonormal vector sum to 1 over the points, and so do their means.
+        for j in 0..8 {
+            let sum: f64 = (0..n).map(|v| all[v * 8 + j]).sum();
+            assert!((sum - 1.0).abs() < 1e-12, "column {j}: {sum}");
+        }
+        let w = wks(&values, &vectors, 5);
+        for v in 0..n {
+            for j in 0..5 {
+                assert!((f64::from(w[v * 5 + j]) - all[v * 8 + 3 + j]).abs() < 1e-6);
+            }
+        }
+        // At the lowest energy the lowest vibration, at the highest the highest.
+        for v in 0..n {
+            assert!((f64::from(w[v * 5]) - vectors[(v, 1)].powi(2)).abs() < 1e-3);
+            assert!((f64::from(w[v * 5 + 4]) - vectors[(v, 3)].powi(2)).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn gps_and_shape_dna_leave_out_the_null_space() {
+        let (values, vectors) = path();
+        assert_eq!(null_space(&values), 1);
+        let g = gps(&values, &vectors, 5);
+        for v in 0..4 {
+            assert_eq!(g[5 * v + 1], (vectors[(v, 2)] / values[2].sqrt()) as f32);
+            assert_eq!(g[5 * v + 3..5 * v + 5], [0.0, 0.0]);
+        }
+        let dna = shape_dna(&values, 5);
+        for (x, i) in dna.iter().zip([1, 2, 3, 3, 3]) {
+            assert_eq!(*x, values[i].ln() as f32);
+        }
+    }
+
+    #[test]
+    fn spectra_with_nothing_in_them_give_numbers() {
+        for k in 0..3 {
+            let values = vec![0.0; k];
+            let vectors = DMatrix::from_element(5, k, 1.0);
+            let times = hks_times(&values, 7);
+            assert!(hks(&values, &vectors, &times).iter().all(|x| x.is_finite()));
+            assert!(wks(&values, &vectors, 6).iter().all(|x| *x == 0.0));
+            assert!(gps(&values, &vectors, 3).iter().all(|x| *x == 0.0));
+            assert_eq!(shape_dna(&values, 2), [0.0, 0.0]);
+            assert!(kernels(&values, &vectors, 3, 4).iter().all(|x| *x == 0.0));
+        }
+        let one = kernels(&[0.0, 2.0], &DMatrix::from_element(3, 2, 0.5), 3, 4);
+        assert!(one.iter().all(|x| (x - 0.25).abs() < 1e-12));
+    }
+}

@@ -1,0 +1,359 @@
+//! One connected component becomes its smallest eigenpairs by shifted block Lanczos, complete by
+//! inertia.
+
+use super::SpectrumError;
+use super::component::Component;
+use super::connected::{Pairs, Setting, dense, gap_after};
+use super::polish::verify_and_polish;
+use crate::linalg::block_lanczos::{BlockLanczos, Projection};
+use crate::linalg::ldlt::Factor;
+use crate::linalg::panel::{Basis, Row, WIDTH, zero_panel};
+
+/// Rounds in which eigenvalues that the count says are missing are looked for.
+const MAX_REPAIR: usize = 12;
+
+/// A Krylov space that has grown to this many vectors for each pair wanted (and 1,600 more) will not
+/// converge: the spectrum is one cluster.
+const MOST_VECTORS: usize = 6;
+
+/// Where the Krylov space does not converge, components up to this size are solved densely.
+const DENSE_AT_MOST: usize = 4_000;
+
+/// Share of the wanted eigenvalues that may lie below the shift. Both ends of the wanted range then
+/// converge at about the same time; at 0.4 or 0.7 the space has to be 10 % larger.
+const FEWEST_BELOW: f64 = 0.5;
+const MOST_BELOW: f64 = 0.65;
+
+/// Vectors after which k pairs have usually converged to 1e-8, by experiment on surfaces. A second
+/// look at a space that is too small costs more than a few vectors too many.
+pub(super) fn first_dimension(k: usize) -> usize {
+    (k * 33 / 20 + 170).next_multiple_of(WIDTH)
+}
+
+/// Blocks after which residuals that are `worst` times too large will do: each block divides them by
+/// `10^(2.9 k^-0.22)`, by experiment, on any surface.
+fn blocks_to_go(worst: f64, k: usize) -> usize {
+    let per_block = 2.9 * (k as f64).powf(-0.22);
+    (worst.max(1.0).log10() / per_block).ceil().min(1e3) as usize
+}
+
+/// A solve of one component.
+pub(super) struct Lanczos<'a> {
+    pub(super) component: &'a Component,
+    pub(super) setting: &'a Setting<'a>,
+}
+
+/// Ritz pairs in ascending order of eigenvalue.
+struct Ritz {
+    /// (eigenvalue, its index in the projection, estimate of the residual of the final vector)
+    pairs: Vec<(f64, usize, f64)>,
+}
+
+impl Lanczos<'_> {
+    fn n_null(&self) -> usize {
+        usize::from(self.component.has_null_vector)
+    }
+
+    /// A shift with about 0.6 of the k wanted eigenvalues below it: Weyl's law, corrected by counts.
+    fn interior_shift(&self, k: usize) -> Result<(Factor, f64), SpectrumError> {
+        let k = k as f64;
+        let weyl = 4.0 * std::f64::consts::PI * k / self.component.area;
+        let (mut low, mut high) = (0.0f64, f64::INFINITY);
+        let mut best: Option<(Factor, f64)> = None;
+        let mut shift = 0.6 * weyl;
+        for _ in 0..60 {
+            self.setting.hook.enter("factor")?;
+            let (factor, at) = self.component.factor(shift)?;
+            let count = factor.n_negative as f64;
+            if count >= FEWEST_BELOW * k && count <= (MOST_BELOW * k).max(1.0) {
+                return Ok((factor, at));
+            }
+            if count > MOST_BELOW * k {
+                high = at;
+            } else {
+                low = at;
+            }
+            // The count is about linear in the shift; safeguarded by bisection.
+            let aimed = shift * (0.58 * k / count.max(0.5)).clamp(0.02, 50.0);
+            let bounded = high.is_finite() && low > 0.0;
+            shift = match bounded {
+                true if aimed > low && aimed < high && high > 4.0 * low => aimed,
+                true => (low * high).sqrt(),
+                false => aimed,
+            };
+            let usable = factor.n_negative < k as usize;
+            if usable {
+                best = Some((factor, at));
+            }
+            if bounded && high < 1.02 * low {
+                break;
+            }
+        }
+        match best {
+            Some(found) => Ok(found),
+            None => Ok(self.component.factor(shift)?),
+        }
+    }
+
+    /// At least `k` smallest pairs, all of them below the limit.
+    pub(super) fn run(&self, k: usize) -> Result<Pairs, SpectrumError> {
+        let n = self.component.n();
+        let hook = &self.setting.hook;
+        // At least three pairs, so that a shift fits between them.
+        let (factor, shift) = self.interior_shift(k.max(3))?;
+        let mut locked = Basis::new(n, 1, self.setting.parallel);
+        let null = self.null_panel();
+        if let Some(panel) = &null {
+            locked.push(panel);
+        }
+        let n_below = factor.n_negative.saturating_sub(self.n_null());
+        let capacity = ((n - self.n_null()) / WIDTH - 2).min((MOST_VECTORS * k + 1_600) / WIDTH);
+        let mut space = BlockLanczos::new(
+            n,
+            &locked,
+            capacity.min((2 * k + 400) / WIDTH) + 1,
+            self.setting.seed,
+            self.setting.parallel,
+        )?;
+        let mut target = first_dimension(k).min(capacity * WIDTH);
+        let (ritz, projection, below) = loop {
+            hook.enter("iterate")?;
+            while space.dimension() < target {
+                space.step(&|panel: &mut [Row]| factor.solve(panel))?;
+                hook.enter("iterate")?;
+            }
+            hook.enter("check")?;
+            let projection = space.projection()?;
+            let ritz = self.ritz(&projection, shift);
+            let worst = self.worst(&ritz, k - self.n_null().min(k));
+            let below = ritz.pairs.iter().filter(|p| p.0 < shift).count();
+            let gap = self.gap(&ritz, k);
+            if worst <= 1.0
+                && below >= n_below
+                && let Some((j, _, _)) = gap
+                && self.worst(&ritz, j - self.n_null()) <= 1.0
+            {
+                break (ritz, projection, j);
+            }
+            if space.dimension() + WIDTH > capacity * WIDTH {
+                if n <= DENSE_AT_MOST {
+                    return dense(self.component, k, self.setting);
+                }
+                return Err(SpectrumError::NotConverged {
+                    k,
+                    n_krylov: space.dimension(),
+                });
+            }
+            let more = (blocks_to_go(worst, k) * WIDTH).min(space.dimension() / 4);
+            target = (space.dimension() + more.max(WIDTH)).min(capacity * WIDTH);
+        };
+        hook.enter("vectors")?;
+        let n_krylov = space.dimension();
+        let count = below - self.n_null();
+        let chosen: Vec<usize> = ritz.pairs[..count].iter().map(|p| p.1).collect();
+        let panels = space.vectors(&projection, &chosen);
+        let mut values: Vec<f64> = ritz.pairs[..count].iter().map(|p| p.0).collect();
+        let panels = match null {
+            None => panels,
+            Some(null) => {
+                values.insert(0, 0.0);
+                with_first_column(&null, &panels, values.len())
+            }
+        };
+        let (_, limit, margin) = self
+            .gap(&ritz, k)
+            .ok_or(SpectrumError::NoGap { k, n_krylov })?;
+        let mut pairs = Pairs {
+            values,
+            residuals: Vec::new(),
+            panels,
+            limit,
+            margin,
+            perturbation: 0.0,
+            n_krylov,
+            n_polish: 0,
+            n_repair: 0,
+        };
+        self.complete(&factor, shift, &mut pairs)?;
+        verify_and_polish(self.component, self.setting, &mut pairs)?;
+        Ok(pairs)
+    }
+
+    fn null_panel(&self) -> Option<Vec<Row>> {
+        self.component.has_null_vector.then(|| {
+            let mut panel = zero_panel(self.component.n());
+            for (row, x) in panel.iter_mut().zip(self.component.null_vector()) {
+                row.0[0] = x;
+            }
+            panel
+        })
+    }
+
+    fn ritz(&self, projection: &Projection, shift: f64) -> Ritz {
+        // Ritz values that map below zero are the unconverged middle of the inverted spectrum.
+        let floor = -1e-6 * shift.abs();
+        let mut pairs: Vec<(f64, usize, f64)> = projection
+            .values
+            .iter()
+            .zip(&projection.residuals)
+            .enumerate()
+            .filter(|(_, (theta, _))| **theta != 0.0)
+            .map(|(e, (theta, r))| (shift + 1.0 / theta, e, r / (theta * theta)))
+            .filter(|p| p.0 > floor)
+            .collect();
+        pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Ritz { pairs }
+    }
+
+    /// Largest residual of the first `count` pairs, in units of what is allowed.
+    fn worst(&self, ritz: &Ritz, count: usize) -> f64 {
+        if ritz.pairs.len() < count {
+            return f64::INFINITY;
+        }
+        let smallest = ritz.pairs.first().map_or(0.0, |p| p.0);
+        let allowed = |value: f64| 0.5 * self.setting.tolerance * value.max(smallest).abs();
+        ritz.pairs[..count]
+            .iter()
+            .map(|p| p.2 / allowed(p.0))
+            .fold(0.0, f64::max)
+    }
+
+    fn gap(&self, ritz: &Ritz, k: usize) -> Option<(usize, f64, f64)> {
+        let nulls = std::iter::repeat_n(0.0, self.n_null());
+        let values: Vec<f64> = nulls.chain(ritz.pairs.iter().map(|p| p.0)).collect();
+        if values.len() <= k {
+            return None;
+        }
+        gap_after(&values, k, self.component.n())
+    }
+
+    /// Compares the count of eigenvalues below the limit with the pairs found, and looks for
+    /// missing ones in the orthogonal complement of those found.
+    fn complete(
+        &self,
+        factor: &Factor,
+        shift: f64,
+        pairs: &mut Pairs,
+    ) -> Result<(), SpectrumError> {
+        let n = self.component.n();
+        for round in 0..=MAX_REPAIR {
+            self.setting.hook.enter("certify")?;
+            let (at_limit, limit) = self.component.factor(pairs.limit)?;
+            pairs.limit = limit;
+            pairs.perturbation = at_limit.perturbation;
+            let (expected, found) = (at_limit.n_negative, pairs.values.len());
+            if expected == found {
+                return Ok(());
+            }
+            if expected < found || round == MAX_REPAIR {
+                return Err(SpectrumError::Incomplete {
+                    tau: limit,
+                    expected,
+                    found,
+                });
+            }
+            drop(at_limit);
+            self.setting.hook.enter("repair")?;
+            pairs.n_repair += 1;
+            let mut locked = Basis::new(n, pairs.panels.len(), self.setting.parallel);
+            for panel in &pairs.panels {
+                locked.push(panel);
+            }
+            let (values, panels) =
+                self.missing(factor, shift, &locked, expected - found, limit, round)?;
+            if values.is_empty() {
+                continue;
+            }
+            merge(pairs, &values, &panels);
+        }
+        Ok(())
+    }
+
+    /// Up to `wanted` eigenpairs below `limit` orthogonal to `locked`.
+    fn missing(
+        &self,
+        factor: &Factor,
+        shift: f64,
+        locked: &Basis,
+        wanted: usize,
+        limit: f64,
+        round: usize,
+    ) -> Result<(Vec<f64>, Vec<Vec<Row>>), SpectrumError> {
+        let n = self.component.n();
+        let found = locked.n_panels() * WIDTH;
+        let capacity = (n.saturating_sub(found) / WIDTH).saturating_sub(2);
+        let seed = self.setting.seed.wrapping_add(1 + round as u64);
+        let mut space =
+            BlockLanczos::new(n, locked, capacity.min(32), seed, self.setting.parallel)?;
+        let mut target = (4 * WIDTH + wanted * 3 / 2).next_multiple_of(WIDTH);
+        loop {
+            while space.dimension() < target.min(capacity * WIDTH) {
+                self.setting.hook.enter("repair")?;
+                space.step(&|panel: &mut [Row]| factor.solve(panel))?;
+            }
+            let projection = space.projection()?;
+            let ritz = self.ritz(&projection, shift);
+            let count = ritz.pairs.iter().take_while(|p| p.0 < limit).count();
+            let full = space.dimension() + WIDTH > capacity * WIDTH;
+            let scale = self.setting.tolerance * limit.abs();
+            let worst = ritz.pairs[..count]
+                .iter()
+                .map(|p| p.2 / scale)
+                .fold(0.0, f64::max);
+            if (worst <= 1.0 && count >= wanted.min(WIDTH)) || full || space.dimension() > 1_600 {
+                let good: Vec<_> = ritz.pairs[..count]
+                    .iter()
+                    .filter(|p| p.2 <= scale)
+                    .collect();
+                let values = good.iter().map(|p| p.0).collect();
+                let chosen: Vec<usize> = good.iter().map(|p| p.1).collect();
+                return Ok((values, space.vectors(&projection, &chosen)));
+            }
+            target = space.dimension() + 2 * WIDTH;
+        }
+    }
+}
+
+/// Moves all columns of `panels` one to the right and puts column 0 of `first` before them.
+fn with_first_column(first: &[Row], panels: &[Vec<Row>], count: usize) -> Vec<Vec<Row>> {
+    let rows = first.len();
+    let mut out = vec![vec![Row::ZERO; rows]; count.div_ceil(WIDTH)];
+    for i in 0..rows {
+        let mut carried = first[i].0[0];
+        for (p, panel) in out.iter_mut().enumerate() {
+            let source = panels.get(p).map_or([0.0; WIDTH], |s| s[i].0);
+            panel[i].0[0] = carried;
+            panel[i].0[1..].copy_from_slice(&source[..WIDTH - 1]);
+            carried = source[WIDTH - 1];
+        }
+    }
+    out
+}
+
+/// Adds further pairs, in ascending order.
+fn merge(pairs: &mut Pairs, values: &[f64], panels: &[Vec<Row>]) {
+    let old = pairs.values.len();
+    let mut order: Vec<(f64, usize)> = pairs
+        .values
+        .iter()
+        .chain(values)
+        .copied()
+        .enumerate()
+        .map(|(i, v)| (v, i))
+        .collect();
+    order.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let rows = pairs.panels[0].len();
+    let mut out = vec![vec![Row::ZERO; rows]; order.len().div_ceil(WIDTH)];
+    for (new, &(_, from)) in order.iter().enumerate() {
+        let (source, from) = if from < old {
+            (&pairs.panels, from)
+        } else {
+            (&panels.to_vec(), from - old)
+        };
+        for (row, s) in out[new / WIDTH].iter_mut().zip(&source[from / WIDTH]) {
+            row.0[new % WIDTH] = s.0[from % WIDTH];
+        }
+    }
+    pairs.values = order.iter().map(|o| o.0).collect();
+    pairs.panels = out;
+}
