@@ -26,13 +26,33 @@ fn home_with_folder() -> (Home, String) {
 fn help_tells_the_commands_and_the_exit_codes() {
     let text = stdout(&coseg().arg("--help").output().unwrap(), 0);
     for command in [
-        "serve", "add", "wait", "ls", "show", "labels", "export", "map", "nearest", "rm", "watch",
-        "events", "name", "collections", "stats", "stop", "check", "config", "synth",
+        "serve",
+        "add",
+        "wait",
+        "ls",
+        "show",
+        "labels",
+        "export",
+        "map",
+        "nearest",
+        "rm",
+        "watch",
+        "events",
+        "name",
+        "collections",
+        "stats",
+        "stop",
+        "check",
+        "config",
+        "synth",
     ] {
         let at_start = |l: &str| l.trim_start().starts_with(command);
         assert!(text.lines().any(at_start), "{command}: {text}");
     }
-    assert!(text.contains("3  no answer from a daemon within --timeout"), "{text}");
+    assert!(
+        text.contains("3  no answer from a daemon within --timeout"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -48,7 +68,12 @@ fn wrong_command_lines_exit_2() {
         &["serve", "--config", "/nonexistent.toml"],
     ] {
         let output = coseg().args(args).output().unwrap();
-        assert_eq!(output.status.code(), Some(2), "{args:?}: {}", stderr(&output));
+        assert_eq!(
+            output.status.code(),
+            Some(2),
+            "{args:?}: {}",
+            stderr(&output)
+        );
         assert!(output.stdout.is_empty(), "{args:?}");
     }
 }
@@ -73,30 +98,59 @@ fn the_configuration_is_checked_and_shown() {
     let home = Home::new();
     let run = |args: &[&str], env: &[(&str, &str)]| {
         let mut command = coseg();
-        command.args(args).env("HOME", home.dir.path()).env_remove("XDG_DATA_HOME");
-        command.env("XDG_RUNTIME_DIR", "/run/user/7").envs(env.iter().copied()).output().unwrap()
+        command
+            .args(args)
+            .env("HOME", home.dir.path())
+            .env_remove("XDG_DATA_HOME");
+        command
+            .env("XDG_RUNTIME_DIR", "/run/user/7")
+            .envs(env.iter().copied())
+            .output()
+            .unwrap()
     };
     let file = home.mesh("c.toml", "[work]\nworkers = 3\n");
-    let shown = json(&run(&["config", "show", "--config", &file, "--json"], &[]), 0);
-    assert_eq!(shown["in_use"]["endpoint"], "ipc:///run/user/7/coseg/coseg.sock");
-    assert_eq!(shown["in_use"]["events"], "ipc:///run/user/7/coseg/coseg.sock.events");
-    let library = home.path(".local/share/coseg/library").display().to_string();
+    let shown = json(
+        &run(&["config", "show", "--config", &file, "--json"], &[]),
+        0,
+    );
+    assert_eq!(
+        shown["in_use"]["endpoint"],
+        "ipc:///run/user/7/coseg/coseg.sock"
+    );
+    assert_eq!(
+        shown["in_use"]["events"],
+        "ipc:///run/user/7/coseg/coseg.sock.events"
+    );
+    let library = home
+        .path(".local/share/coseg/library")
+        .display()
+        .to_string();
     assert_eq!(shown["in_use"]["library"], library);
     assert_eq!(shown["in_use"]["workers"], 3);
     assert_eq!(shown["settings"]["limits"]["memory"], "2GiB");
     // What is shown is a configuration file.
     let text = stdout(&run(&["config", "show", "--config", &file], &[]), 0);
     let again = home.mesh("again.toml", &text);
-    assert_eq!(stdout(&run(&["config", "show", "--config", &again], &[]), 0), text);
-    let layered = run(&["config", "show", "--config", &file, "--json"], &[("COSEG__WORK__WORKERS", "5")]);
+    assert_eq!(
+        stdout(&run(&["config", "show", "--config", &again], &[]), 0),
+        text
+    );
+    let layered = run(
+        &["config", "show", "--config", &file, "--json"],
+        &[("COSEG__WORK__WORKERS", "5")],
+    );
     assert_eq!(json(&layered, 0)["settings"]["work"]["workers"], 5);
 
-    assert_eq!(stdout(&run(&["config", "check", "--config", &file], &[]), 0), "the configuration is valid\n");
+    assert_eq!(
+        stdout(&run(&["config", "check", "--config", &file], &[]), 0),
+        "the configuration is valid\n"
+    );
     let wrong = home.mesh("wrong.toml", "[work]\nworker = 3\n");
     let output = run(&["config", "check", "--config", &wrong], &[]);
     assert_eq!(output.status.code(), Some(2));
-    let expected =
-        format!("coseg: {wrong}: unknown key \"work.worker\"; the nearest known one is \"work.workers\"\n");
+    let expected = format!(
+        "coseg: {wrong}: unknown key \"work.worker\"; the nearest known one is \"work.workers\"\n"
+    );
     assert_eq!(stderr(&output), expected);
     let output = run(&["config", "check"], &[("COSEG__LIMITS__MEMROY", "1GiB")]);
     assert_eq!(
@@ -105,8 +159,10 @@ fn the_configuration_is_checked_and_shown() {
          the nearest known one is \"COSEG__LIMITS__MEMORY\"\n"
     );
     // Neither of these is a setting.
-    let output =
-        run(&["config", "check"], &[("COSEG_ENDPOINT", "ipc:///x/y"), ("COSEG_TEST_DATA", "/x")]);
+    let output = run(
+        &["config", "check"],
+        &[("COSEG_ENDPOINT", "ipc:///x/y"), ("COSEG_TEST_DATA", "/x")],
+    );
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
 }
 
@@ -114,20 +170,47 @@ fn the_configuration_is_checked_and_shown() {
 fn a_folder_becomes_labelled_shapes_and_files() {
     let (home, folder) = home_with_folder();
     let _daemon = home.start();
-    let output = home.coseg(&["add", &folder, "--collection", "skittles", "--parts", "2", "--json"]);
+    let output = home.coseg(&[
+        "add",
+        &folder,
+        "--collection",
+        "skittles",
+        "--parts",
+        "2",
+        "--json",
+    ]);
     let added = json(&output, 0);
-    assert!(stderr(&output).contains("part.step is skipped"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("part.step is skipped"),
+        "{}",
+        stderr(&output)
+    );
     assert!(!stderr(&output).contains("labels.txt"));
     let names = |value: &serde_json::Value| {
         let shapes = value["shapes"].as_array().unwrap().iter();
-        shapes.map(|s| s["name"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+        shapes
+            .map(|s| s["name"].as_str().unwrap().to_owned())
+            .collect::<Vec<_>>()
     };
     assert_eq!(names(&added), ["9", "10", "Big One"]);
     assert_eq!(added["n_added"], 3);
-    assert!(added["shapes"][0]["stages_ms"]["spectrum"].as_f64().unwrap() > 0.0);
+    assert!(
+        added["shapes"][0]["stages_ms"]["spectrum"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
 
     // The same again, with settings that are those of the collection, or with none.
-    let again = home.coseg(&["add", &folder, "--collection", "skittles", "--parts", "2", "--json"]);
+    let again = home.coseg(&[
+        "add",
+        &folder,
+        "--collection",
+        "skittles",
+        "--parts",
+        "2",
+        "--json",
+    ]);
     assert_eq!(json(&again, 0)["n_unchanged"], 3);
     let again = stdout(&home.coseg(&["add", &folder]), 0);
     assert_eq!(again, "9: unchanged\n10: unchanged\nBig One: unchanged\n");
@@ -137,27 +220,57 @@ fn a_folder_becomes_labelled_shapes_and_files() {
     let differs = home.coseg(&["add", &folder, "--collection", "skittles", "--up", "+y"]);
     assert!(stderr(&differs).ends_with("coseg: collection \"skittles\" has up unknown, not +y\n"));
 
-    assert_eq!(stdout(&home.coseg(&["wait", "--collection", "skittles"]), 0), "");
-    let listed = json(&home.coseg(&["ls", "--collection", "skittles", "--json"]), 0);
+    assert_eq!(
+        stdout(&home.coseg(&["wait", "--collection", "skittles"]), 0),
+        ""
+    );
+    let listed = json(
+        &home.coseg(&["ls", "--collection", "skittles", "--json"]),
+        0,
+    );
     assert_eq!(names(&listed), ["9", "10", "Big One"]);
     let table = stdout(&home.coseg(&["ls"]), 0);
-    let heading = "collection  shapes  stale  labels  parts  up       sequence\nskittles    3       0 ";
+    let heading =
+        "collection  shapes  stale  labels  parts  up       sequence\nskittles    3       0 ";
     assert!(table.starts_with(heading), "{table}");
 
     let labels = stdout(&home.coseg(&["labels", "Big One"]), 0);
     assert_eq!(labels.lines().count(), SKITTLE_FACES);
-    let as_json = json(&home.coseg(&["labels", "Big One", "--json", "--confidence"]), 0);
-    assert_eq!(as_json["confidence"].as_array().unwrap().len(), SKITTLE_FACES);
+    let as_json = json(
+        &home.coseg(&["labels", "Big One", "--json", "--confidence"]),
+        0,
+    );
+    assert_eq!(
+        as_json["confidence"].as_array().unwrap().len(),
+        SKITTLE_FACES
+    );
 
     let out = home.path("out/deep").display().to_string();
-    let args = ["export", "--collection", "skittles", "--format", "labels", "--out", &out];
+    let args = [
+        "export",
+        "--collection",
+        "skittles",
+        "--format",
+        "labels",
+        "--out",
+        &out,
+    ];
     assert_eq!(stdout(&home.coseg(&args), 0), "");
-    assert_eq!(std::fs::read_to_string(format!("{out}/Big One.labels.txt")).unwrap(), labels);
-    let files = json(&home.coseg(&["export", "--format", "ply", "--out", &out, "10", "--json"]), 0);
+    assert_eq!(
+        std::fs::read_to_string(format!("{out}/Big One.labels.txt")).unwrap(),
+        labels
+    );
+    let files = json(
+        &home.coseg(&["export", "--format", "ply", "--out", &out, "10", "--json"]),
+        0,
+    );
     assert_eq!(files["files"], serde_json::json!([format!("{out}/10.ply")]));
     let ply = std::fs::read_to_string(format!("{out}/10.ply")).unwrap();
     assert!(ply.contains(&format!("element face {SKITTLE_FACES}\n")));
-    stdout(&home.coseg(&["export", "--format", "obj", "--out", &out]), 0);
+    stdout(
+        &home.coseg(&["export", "--format", "obj", "--out", &out]),
+        0,
+    );
     assert!(exists(format!("{out}/9.obj")) && exists(format!("{out}/labels.mtl")));
 }
 
@@ -165,7 +278,10 @@ fn a_folder_becomes_labelled_shapes_and_files() {
 fn shapes_are_compared_named_and_removed() {
     let (home, folder) = home_with_folder();
     let _daemon = home.start();
-    stdout(&home.coseg(&["add", &folder, "--collection", "c", "--parts", "2"]), 0);
+    stdout(
+        &home.coseg(&["add", &folder, "--collection", "c", "--parts", "2"]),
+        0,
+    );
     let nearest = json(&home.coseg(&["nearest", "9", "--json"]), 0);
     assert_eq!(nearest["nearest"].as_array().unwrap().len(), 2);
     let file = home.path("map.safetensors").display().to_string();
@@ -175,7 +291,10 @@ fn shapes_are_compared_named_and_removed() {
     let arrays = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let shape: Vec<u64> = serde_json::from_value(map["c_12_shape"].clone()).unwrap();
     let c_12 = arrays.tensor("c_12").unwrap();
-    assert_eq!(c_12.shape().iter().map(|&n| n as u64).collect::<Vec<_>>(), shape);
+    assert_eq!(
+        c_12.shape().iter().map(|&n| n as u64).collect::<Vec<_>>(),
+        shape
+    );
     assert!(stdout(&home.coseg(&["map", "9", "10"]), 0).starts_with("9 to 10: c_12 ("));
 
     let shown = json(&home.coseg(&["show", "--json"]), 0);
@@ -183,7 +302,10 @@ fn shapes_are_compared_named_and_removed() {
     let named = json(&home.coseg(&["name", &label, "head", "--json"]), 0);
     assert_eq!(named["name"], "head");
     assert!(stdout(&home.coseg(&["show"]), 0).contains(&format!("{label}      head")));
-    assert!(stdout(&home.coseg(&["show", "9"]), 0).starts_with("9: shape 1 of its collection, 736 faces"));
+    assert!(
+        stdout(&home.coseg(&["show", "9"]), 0)
+            .starts_with("9: shape 1 of its collection, 736 faces")
+    );
 
     let events = json(&home.coseg(&["events", "--json"]), 0);
     let events = events["events"].as_array().unwrap().clone();
@@ -191,15 +313,29 @@ fn shapes_are_compared_named_and_removed() {
     assert_eq!(events.last().unwrap()["kind"], "label_named");
     // All that were, then it ends.
     let n = events.len().to_string();
-    let watched = home.coseg(&["watch", "--collection", "c", "--since", "0", "-n", &n, "--json"]);
+    let watched = home.coseg(&[
+        "watch",
+        "--collection",
+        "c",
+        "--since",
+        "0",
+        "-n",
+        &n,
+        "--json",
+    ]);
     let watched = stdout(&watched, 0);
-    let watched: Vec<serde_json::Value> =
-        watched.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let watched: Vec<serde_json::Value> = watched
+        .lines()
+        .map(|l| serde_json::from_str(l).unwrap())
+        .collect();
     assert_eq!(watched, events);
 
     assert_eq!(stdout(&home.coseg(&["rm", "9"]), 0), "");
     let gone = home.coseg(&["labels", "9"]);
-    assert_eq!((gone.status.code(), stderr(&gone).as_str()), (Some(1), "coseg: no shape named \"9\"\n"));
+    assert_eq!(
+        (gone.status.code(), stderr(&gone).as_str()),
+        (Some(1), "coseg: no shape named \"9\"\n")
+    );
     let gone = home.coseg(&["rm", "9", "10", "--json"]);
     let removed = json(&gone, 1);
     assert_eq!(removed["removed"], serde_json::json!(["10"]));
@@ -215,14 +351,20 @@ fn one_refused_shape_fails_the_command_and_not_the_others() {
     let output = home.coseg(&["add", &bad, &good]);
     assert_eq!(output.status.code(), Some(1));
     let said = stderr(&output);
-    assert!(said.contains("coseg: bad: face 0 names vertex 9, but the mesh has 3\n"), "{said}");
+    assert!(
+        said.contains("coseg: bad: face 0 names vertex 9, but the mesh has 3\n"),
+        "{said}"
+    );
     assert!(said.contains("default: 1 added, 1 failed in "), "{said}");
     // Other bytes under the name are refused, or replace it.
     home.mesh("good.off", &skittle(1));
     let taken = json(&home.coseg(&["add", &good, "--json"]), 1);
     assert_eq!(taken["shapes"][0]["error"]["code"], "ALREADY_EXISTS");
     let replaced = json(&home.coseg(&["add", &good, "--replace", "--json"]), 0);
-    assert_eq!((&replaced["n_replaced"], &replaced["n_added"]), (&1.into(), &0.into()));
+    assert_eq!(
+        (&replaced["n_replaced"], &replaced["n_added"]),
+        (&1.into(), &0.into())
+    );
 }
 
 #[test]
@@ -230,9 +372,15 @@ fn collections_must_be_named_when_there_are_several() {
     let home = Home::new();
     let _daemon = home.start();
     let none = home.coseg(&["show"]);
-    assert_eq!((none.status.code(), stderr(&none).as_str()), (Some(1), "coseg: there is no collection yet\n"));
+    assert_eq!(
+        (none.status.code(), stderr(&none).as_str()),
+        (Some(1), "coseg: there is no collection yet\n")
+    );
     for name in ["a", "b"] {
-        stdout(&home.coseg(&["collections", "create", name, "--up", "-z"]), 0);
+        stdout(
+            &home.coseg(&["collections", "create", name, "--up", "-z"]),
+            0,
+        );
     }
     let mesh = home.mesh("m.off", &skittle(0));
     for args in [&["show"][..], &["add", &mesh]] {
@@ -241,7 +389,10 @@ fn collections_must_be_named_when_there_are_several() {
         let expected = "coseg: there are several collections, choose one with --collection: a, b\n";
         assert_eq!(stderr(&output), expected);
     }
-    assert_eq!(json(&home.coseg(&["show", "-c", "a", "--json"]), 0)["up"], "-z");
+    assert_eq!(
+        json(&home.coseg(&["show", "-c", "a", "--json"]), 0)["up"],
+        "-z"
+    );
     stdout(&home.coseg(&["collections", "delete", "b"]), 0);
     assert_eq!(stdout(&home.coseg(&["add", &mesh, "--no-wait"]), 0), "");
     stdout(&home.coseg(&["wait", "-c", "a"]), 0);
@@ -257,14 +408,23 @@ fn a_library_is_checked_without_a_daemon() {
     let library = home.path("library").display().to_string();
     let held = home.coseg(&["check", "--library", &library]);
     assert_eq!(held.status.code(), Some(1));
-    assert!(stderr(&held).contains("is held by another process"), "{}", stderr(&held));
+    assert!(
+        stderr(&held).contains("is held by another process"),
+        "{}",
+        stderr(&held)
+    );
     stdout(&home.coseg(&["stop"]), 0);
     assert_eq!(daemon.ended().0.code(), Some(0));
     let good = json(&home.coseg(&["check", "--library", &library, "--json"]), 0);
-    assert_eq!((&good["ok"], &good["findings"]), (&true.into(), &serde_json::json!([])));
+    assert_eq!(
+        (&good["ok"], &good["findings"]),
+        (&true.into(), &serde_json::json!([]))
+    );
     // Damage is found.
     let objects = home.path("library/objects");
-    let file = files_below(&objects).into_iter().find(|f| f.extension().is_some_and(|e| e == "safetensors"));
+    let file = files_below(&objects)
+        .into_iter()
+        .find(|f| f.extension().is_some_and(|e| e == "safetensors"));
     let file = file.unwrap();
     let mut bytes = std::fs::read(&file).unwrap();
     let middle = bytes.len() / 2;
@@ -279,6 +439,10 @@ fn a_library_is_checked_without_a_daemon() {
 }
 
 fn files_below(directory: &std::path::Path) -> Vec<std::path::PathBuf> {
-    let entries = std::fs::read_dir(directory).unwrap().map(|e| e.unwrap().path());
-    entries.flat_map(|p| if p.is_dir() { files_below(&p) } else { vec![p] }).collect()
+    let entries = std::fs::read_dir(directory)
+        .unwrap()
+        .map(|e| e.unwrap().path());
+    entries
+        .flat_map(|p| if p.is_dir() { files_below(&p) } else { vec![p] })
+        .collect()
 }

@@ -22,7 +22,12 @@ pub(crate) fn coseg() -> Command {
             command.env_remove(name);
         }
     }
-    for name in ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "RUNTIME_DIRECTORY"] {
+    for name in [
+        "NOTIFY_SOCKET",
+        "WATCHDOG_USEC",
+        "WATCHDOG_PID",
+        "RUNTIME_DIRECTORY",
+    ] {
         command.env_remove(name);
     }
     command.env("NO_COLOR", "1");
@@ -36,7 +41,9 @@ pub(crate) struct Home {
 
 impl Home {
     pub(crate) fn new() -> Self {
-        Self { dir: tempfile::Builder::new().prefix("coseg").tempdir().unwrap() }
+        Self {
+            dir: tempfile::Builder::new().prefix("coseg").tempdir().unwrap(),
+        }
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
@@ -83,11 +90,17 @@ impl Home {
         let notify = UnixDatagram::bind(&notify_path).unwrap();
         notify.set_read_timeout(Some(DEADLINE)).unwrap();
         let mut command = coseg();
-        command.arg("serve").arg("--library").arg(self.path("library"));
+        command
+            .arg("serve")
+            .arg("--library")
+            .arg(self.path("library"));
         if !args.contains(&"--endpoint") {
             command.args(["--endpoint", &self.endpoint()]);
         }
-        command.args(args).env("NOTIFY_SOCKET", &notify_path).envs(env.iter().copied());
+        command
+            .args(args)
+            .env("NOTIFY_SOCKET", &notify_path)
+            .envs(env.iter().copied());
         let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
         let (lines_in, lines) = mpsc::channel();
         let stderr = BufReader::new(child.stderr.take().unwrap());
@@ -98,7 +111,13 @@ impl Home {
                 }
             }
         });
-        Daemon { child, notify, lines, said: Vec::new(), endpoint: self.endpoint() }
+        Daemon {
+            child,
+            notify,
+            lines,
+            said: Vec::new(),
+            endpoint: self.endpoint(),
+        }
     }
 }
 
@@ -118,7 +137,10 @@ impl Daemon {
         let mut buffer = [0_u8; 4096];
         loop {
             let n = self.notify.recv(&mut buffer).unwrap_or_else(|e| {
-                panic!("no {line:?} ({e}); stderr: {:#?}", self.lines.try_iter().collect::<Vec<_>>())
+                panic!(
+                    "no {line:?} ({e}); stderr: {:#?}",
+                    self.lines.try_iter().collect::<Vec<_>>()
+                )
             });
             let text = String::from_utf8(buffer[..n].to_vec()).unwrap();
             if text.lines().any(|l| l == line) {
@@ -197,21 +219,29 @@ pub(crate) fn add_request(
     shapes: &[(&str, &str)],
     mode: wire::AddMode,
 ) -> (request::Body, Vec<bytes::Bytes>) {
-    let inputs = shapes.iter().enumerate().map(|(i, (name, _))| wire::ShapeInput {
-        name: (*name).to_owned(),
-        replace: false,
-        source: Some(wire::shape_input::Source::Encoded(wire::EncodedMesh {
-            format: wire::MeshFormat::Off.into(),
-            bytes: Some(wire::BytesRef { frame: i as u32 }),
-        })),
-    });
+    let inputs = shapes
+        .iter()
+        .enumerate()
+        .map(|(i, (name, _))| wire::ShapeInput {
+            name: (*name).to_owned(),
+            replace: false,
+            source: Some(wire::shape_input::Source::Encoded(wire::EncodedMesh {
+                format: wire::MeshFormat::Off.into(),
+                bytes: Some(wire::BytesRef { frame: i as u32 }),
+            })),
+        });
     let request = wire::AddShapesRequest {
         collection: collection.to_owned(),
         shapes: inputs.collect(),
         mode: mode.into(),
-        create: Some(wire::CollectionSpec { n_parts: Some(2), ..Default::default() }),
+        create: Some(wire::CollectionSpec {
+            n_parts: Some(2),
+            ..Default::default()
+        }),
     };
-    let frames = shapes.iter().map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
+    let frames = shapes
+        .iter()
+        .map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
     (request::Body::AddShapes(request), frames.collect())
 }
 
