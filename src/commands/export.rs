@@ -22,7 +22,11 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     }
     let colours = session.describe(&collection)?.labels;
     let shapes = match args.shapes.as_slice() {
-        [] => session.shapes(&collection, None)?.into_iter().map(|s| s.name).collect(),
+        [] => session
+            .shapes(&collection, None)?
+            .into_iter()
+            .map(|s| s.name)
+            .collect(),
         some => some.to_vec(),
     };
     std::fs::create_dir_all(&args.out).map_err(|e| at(&args.out, e))?;
@@ -55,7 +59,13 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             }
             ExportFormat::Obj => {
                 let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let text = obj(&mesh.vertices, &polygons(&mesh), &labels, &colours, MATERIALS);
+                let text = obj(
+                    &mesh.vertices,
+                    &polygons(&mesh),
+                    &labels,
+                    &colours,
+                    MATERIALS,
+                );
                 write(format!("{shape}.obj"), text.as_bytes())?;
             }
         }
@@ -67,7 +77,8 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     progress.finish_and_clear();
     if session.json {
         let format = format!("{:?}", args.format).to_lowercase();
-        session.print_json(&json!({ "collection": collection, "format": format, "files": written }))?;
+        session
+            .print_json(&json!({ "collection": collection, "format": format, "files": written }))?;
     } else {
         eprintln!("{} shapes written to {}", shapes.len(), args.out.display());
     }
@@ -75,7 +86,10 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
 }
 
 fn at(path: &Path, source: std::io::Error) -> CommandError {
-    CommandError::File { path: PathBuf::from(path).display().to_string(), source }
+    CommandError::File {
+        path: PathBuf::from(path).display().to_string(),
+        source,
+    }
 }
 
 /// The mesh of a shape as it was sent.
@@ -85,8 +99,10 @@ fn original(
     shape: &str,
     n_labels: usize,
 ) -> Result<ParsedMesh, CommandError> {
-    let request =
-        wire::GetOriginalRequest { collection: collection.to_owned(), shape: shape.to_owned() };
+    let request = wire::GetOriginalRequest {
+        collection: collection.to_owned(),
+        shape: shape.to_owned(),
+    };
     let (reply, frames) = call!(session.client, GetOriginal(request), frames)?;
     let bad = |message: String| CommandError::Client(ClientError::BadReply(message));
     let format = match reply.format() {
