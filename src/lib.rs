@@ -6,24 +6,24 @@
 //! result: the one effect. The daemon is a shell around [`Library`].
 
 // Pure: values in, values out.
+pub mod correspondence;
+pub mod descriptors;
+pub mod fmap;
+pub mod labels;
 pub mod linalg;
 pub mod mesh;
-pub mod operators;
-pub mod spectrum;
-pub mod descriptors;
-pub mod segmentation;
 pub mod neighbors;
-pub mod fmap;
-pub mod correspondence;
-pub mod labels;
+pub mod operators;
 pub mod pipeline;
+pub mod segmentation;
+pub mod spectrum;
 pub mod synth;
 
 // Shell: files, sockets, clocks.
-pub mod store;
-pub mod library;
 pub mod config;
-pub mod ipc;
 pub mod daemon;
+pub mod ipc;
+pub mod library;
+pub mod store;
 
 pub use library::Library;

@@ -34,7 +34,12 @@ pub(super) struct PairSums {
 
 impl Criterion {
     /// The criterion on the patches of some shapes, whose mean descriptors are `means (n_patches, dim)`.
-    pub(super) fn new(patches: &[&PatchGraph], means: &[f64], dim: usize, offsets: &[usize]) -> Self {
+    pub(super) fn new(
+        patches: &[&PatchGraph],
+        means: &[f64],
+        dim: usize,
+        offsets: &[usize],
+    ) -> Self {
         let mut boundaries = Vec::new();
         let mut intra = Vec::new();
         for (graph, &offset) in patches.iter().zip(offsets) {
@@ -43,12 +48,20 @@ impl Criterion {
             for &([a, b], length, crease) in &graph.edges {
                 let (i, j) = (offset + a as usize, offset + b as usize);
                 boundaries.push((i as u32, j as u32, length, length * crease));
-                intra.push((i, j, length / mean_length.max(1e-300) * (-crease / CREASE_SCALE).exp()));
+                intra.push((
+                    i,
+                    j,
+                    length / mean_length.max(1e-300) * (-crease / CREASE_SCALE).exp(),
+                ));
             }
         }
         let n = *offsets.last().unwrap_or(&0);
         let intra = symmetric(n, intra.into_iter());
-        let inter = inter_shape(&Rows { values: means, dim, offsets });
+        let inter = inter_shape(&Rows {
+            values: means,
+            dim,
+            offsets,
+        });
         let length: f64 = boundaries.iter().map(|b| b.2).sum();
         let creased: f64 = boundaries.iter().map(|b| b.3).sum();
         Self {
@@ -60,8 +73,12 @@ impl Criterion {
 
     /// Pair sums of a labelling of all patches with labels below `k`.
     pub(super) fn pair_sums(&self, labels: &[u32], k: usize) -> PairSums {
-        let mut sums =
-            PairSums { k, length: vec![0.0; k * k], creased: vec![0.0; k * k], affinity: vec![0.0; k * k] };
+        let mut sums = PairSums {
+            k,
+            length: vec![0.0; k * k],
+            creased: vec![0.0; k * k],
+            affinity: vec![0.0; k * k],
+        };
         for &(i, j, length, creased) in &self.boundaries {
             let (a, b) = (labels[i as usize] as usize, labels[j as usize] as usize);
             for at in [a * k + b, b * k + a] {

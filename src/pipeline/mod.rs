@@ -5,7 +5,9 @@ mod description;
 mod place;
 mod recluster;
 
-pub use describe::{ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of};
+pub use describe::{
+    ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of,
+};
 pub use description::{Description, DescriptionView, Params};
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
