@@ -180,6 +180,14 @@ pub enum SpectrumError {
         /// Pairs found.
         found: usize,
     },
+    /// The Krylov space grew to its limit.
+    #[error("{k} pairs have not converged in a Krylov space of {n_krylov} vectors, the limit")]
+    NotConverged {
+        /// Wanted.
+        k: usize,
+        /// Dimension of the Krylov space.
+        n_krylov: usize,
+    },
     /// Everything above the k-th eigenvalue is one cluster, as far as was computed.
     #[error("no gap was found above eigenvalue {k} among {n_krylov} approximations")]
     NoGap {
@@ -423,5 +431,7 @@ fn assemble(
     })
 }
 
+#[cfg(test)]
+mod refusal_tests;
 #[cfg(test)]
 mod tests;

@@ -135,18 +135,17 @@ impl Analysis {
         Ok(Self { symbolic, order })
     }
 
-    fn supernodal(&self) -> &SymbolicSupernodalCholesky<u32> {
+    /// `None` for a diagonal matrix, whose analysis has no supernodes.
+    fn supernodal(&self) -> Option<&SymbolicSupernodalCholesky<u32>> {
         match self.symbolic.raw() {
-            SymbolicCholeskyRaw::Supernodal(s) => s,
-            SymbolicCholeskyRaw::Simplicial(_) => {
-                unreachable!("the supernodal analysis was asked for")
-            }
+            SymbolicCholeskyRaw::Supernodal(s) => Some(s),
+            SymbolicCholeskyRaw::Simplicial(_) => None,
         }
     }
 
     /// Entries of L as stored.
     pub fn n_factor_entries(&self) -> usize {
-        self.supernodal().len_val()
+        self.symbolic.len_val()
     }
 }
 
@@ -188,7 +187,9 @@ impl Factor {
         shift: f64,
     ) -> Result<Self, LdltError> {
         let n = matrix.n();
-        let symbolic = analysis.supernodal();
+        let Some(symbolic) = analysis.supernodal() else {
+            return Self::of_diagonal(matrix, shift);
+        };
         let mut starts = Vec::with_capacity(n + 1);
         let mut row_indices = Vec::with_capacity(matrix.columns.len() / 2 + n);
         let mut values = Vec::with_capacity(matrix.columns.len() / 2 + n);
@@ -227,6 +228,41 @@ impl Factor {
             },
         )?;
         Self::packed(symbolic, &factor)
+    }
+
+    fn of_diagonal(matrix: &SymmetricSparse, shift: f64) -> Result<Self, LdltError> {
+        let n = matrix.n();
+        assert_eq!(
+            matrix.columns.len(),
+            n,
+            "invariant: only a diagonal has no supernodes"
+        );
+        let mut out = Self {
+            n_negative: 0,
+            perturbation: 0.0,
+            blocks: Vec::new(),
+            rows: Vec::new(),
+            values: vec![0.0; n],
+            inverse_pivots: Vec::with_capacity(n),
+        };
+        for (index, x) in matrix.values.iter().enumerate() {
+            let pivot = x - shift;
+            if pivot == 0.0 || !pivot.is_finite() {
+                return Err(LdltError::ZeroPivot { index, n });
+            }
+            out.n_negative += usize::from(pivot < 0.0);
+            out.inverse_pivots.push(1.0 / pivot);
+            out.perturbation = f64::max(out.perturbation, f64::EPSILON * pivot.abs());
+            let rows = (0, 0);
+            out.blocks.push(Block {
+                column: index,
+                width: 1,
+                n_local: 0,
+                value: index,
+                rows,
+            });
+        }
+        Ok(out)
     }
 
     fn packed(

@@ -9,3 +9,6 @@ pub mod ldlt;
 pub mod maxflow;
 pub mod nearest;
 pub mod panel;
+
+#[cfg(test)]
+mod spectral_tests;

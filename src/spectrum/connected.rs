@@ -50,7 +50,7 @@ pub(super) fn smallest(
     setting: &Setting,
 ) -> Result<Pairs, SpectrumError> {
     let n = component.n();
-    let krylov = first_dimension(k, n);
+    let krylov = first_dimension(k);
     if n <= DENSE_ALWAYS || krylov + 4 * WIDTH > n * 3 / 4 {
         return dense(component, k, setting);
     }

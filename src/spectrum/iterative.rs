@@ -12,17 +12,22 @@ use crate::linalg::panel::{Basis, Row, WIDTH, zero_panel};
 /// Rounds in which eigenvalues that the count says are missing are looked for.
 const MAX_REPAIR: usize = 12;
 
+/// A Krylov space that has grown to this many vectors for each pair wanted (and 1,600 more) will not
+/// converge: the spectrum is one cluster.
+const MOST_VECTORS: usize = 6;
+
+/// Where the Krylov space does not converge, components up to this size are solved densely.
+const DENSE_AT_MOST: usize = 4_000;
+
 /// Share of the wanted eigenvalues that may lie below the shift. Both ends of the wanted range then
 /// converge at about the same time; at 0.4 or 0.7 the space has to be 10 % larger.
 const FEWEST_BELOW: f64 = 0.5;
 const MOST_BELOW: f64 = 0.65;
 
-/// Vectors after which k of n pairs have usually converged to 1e-8, by experiment on surfaces; the
-/// spectrum of a coarse mesh ends soon after k, which helps.
-pub(super) fn first_dimension(k: usize, n: usize) -> usize {
-    let on_fine_mesh = 1.65 * k as f64 + 170.0;
-    let dimension = on_fine_mesh * (1.0 - 0.5 * (k as f64 / n as f64).min(1.0));
-    (dimension as usize).next_multiple_of(WIDTH)
+/// Vectors after which k pairs have usually converged to 1e-8, by experiment on surfaces. A second
+/// look at a space that is too small costs more than a few vectors too many.
+pub(super) fn first_dimension(k: usize) -> usize {
+    (k * 33 / 20 + 170).next_multiple_of(WIDTH)
 }
 
 /// Blocks after which residuals that are `worst` times too large will do: each block divides them by
@@ -102,7 +107,7 @@ impl Lanczos<'_> {
             locked.push(panel);
         }
         let n_below = factor.n_negative.saturating_sub(self.n_null());
-        let capacity = (n - self.n_null()) / WIDTH - 2;
+        let capacity = ((n - self.n_null()) / WIDTH - 2).min((MOST_VECTORS * k + 1_600) / WIDTH);
         let mut space = BlockLanczos::new(
             n,
             &locked,
@@ -110,7 +115,7 @@ impl Lanczos<'_> {
             self.setting.seed,
             self.setting.parallel,
         )?;
-        let mut target = first_dimension(k, n).min(capacity * WIDTH);
+        let mut target = first_dimension(k).min(capacity * WIDTH);
         let (ritz, projection, below) = loop {
             hook.enter("iterate")?;
             while space.dimension() < target {
@@ -131,7 +136,13 @@ impl Lanczos<'_> {
                 break (ritz, projection, j);
             }
             if space.dimension() + WIDTH > capacity * WIDTH {
-                return dense(self.component, k, self.setting);
+                if n <= DENSE_AT_MOST {
+                    return dense(self.component, k, self.setting);
+                }
+                return Err(SpectrumError::NotConverged {
+                    k,
+                    n_krylov: space.dimension(),
+                });
             }
             let more = (blocks_to_go(worst, k) * WIDTH).min(space.dimension() / 4);
             target = (space.dimension() + more.max(WIDTH)).min(capacity * WIDTH);

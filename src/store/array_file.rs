@@ -299,7 +299,7 @@ impl Layout {
             }
             let begin = tensor.data().as_ptr().addr() - file.as_ptr().addr();
             let alignment = dtype.bitsize() / 8;
-            if begin % alignment != 0 {
+            if !begin.is_multiple_of(alignment) {
                 return Err(ArrayFileError::Alignment {
                     name,
                     offset: begin,

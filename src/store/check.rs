@@ -46,6 +46,10 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
         findings.damage(CATALOG_FILE, "the catalog is missing");
         return Ok(findings.list);
     }
+    let log = catalog::log_of(&path);
+    if let Some(message) = catalog::log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
+        findings.damage(relative(dir, &log), message);
+    }
     let connection = match catalog::open_reader(&path) {
         Ok(connection) => connection,
         Err(error) if error.is_damage() => {
@@ -77,7 +81,9 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     }
     findings.take("shapes", |f| check_shapes(&connection, &reader, &arrays, f));
     findings.take("maps", |f| check_maps(&connection, &reader, &arrays, f));
-    findings.take("collections", |f| check_collections(&connection, &reader, f));
+    findings.take("collections", |f| {
+        check_collections(&connection, &reader, f)
+    });
     findings.take("events", |f| check_events(&connection, f));
     findings.take("jobs", |f| check_jobs(&connection, &reader, f));
     drop(connection);
@@ -96,14 +102,22 @@ impl Findings {
     fn damage(&mut self, place: impl Into<String>, message: impl Into<String>) {
         let (place, message) = (place.into(), message.into());
         if self.seen.insert((place.clone(), message.clone())) {
-            self.list.push(Finding { place, message, damage: true });
+            self.list.push(Finding {
+                place,
+                message,
+                damage: true,
+            });
         }
     }
 
     fn error(&mut self, error: &StoreError) {
         match error {
             StoreError::Damaged { path, message } => self.damage(path, message),
-            StoreError::DamagedRow { table, key, message } => {
+            StoreError::DamagedRow {
+                table,
+                key,
+                message,
+            } => {
                 self.damage(format!("{table} {key}"), message);
             }
             StoreError::Io { path, source } => self.damage(path, source.to_string()),
@@ -171,7 +185,10 @@ fn check_sums(connection: &Connection, findings: &mut Findings) -> Result<(), St
             table.name
         );
         let read = || -> rusqlite::Result<Vec<Option<String>>> {
-            connection.prepare(&sql)?.query_map([], |row| row.get(0))?.collect()
+            connection
+                .prepare(&sql)?
+                .query_map([], |row| row.get(0))?
+                .collect()
         };
         match read() {
             Ok(keys) => {
@@ -227,7 +244,9 @@ fn check_shapes(
     findings: &mut Findings,
 ) -> Result<(), StoreError> {
     for (id, _) in keys::<ShapeId, i64>(connection, "shapes", "id, collection_id")? {
-        let Some(Some(shape)) = findings.keep(reader.shape(id)) else { continue };
+        let Some(Some(shape)) = findings.keep(reader.shape(id)) else {
+            continue;
+        };
         let place = format!("shapes {id}");
         for (kind, digest) in [
             (ObjectKind::Original, shape.content_digest),
@@ -241,7 +260,10 @@ fn check_shapes(
         let described = arrays.get(&shape.description_digest);
         if let Some(described) = described.filter(|d| d.n_polygons != shape.n_polygons) {
             let (row, file) = (shape.n_polygons, described.n_polygons);
-            findings.damage(&place, format!("{row} polygons, but its description has {file}"));
+            findings.damage(
+                &place,
+                format!("{row} polygons, but its description has {file}"),
+            );
         }
         if let Some(None) = findings.keep(reader.signature(id)) {
             findings.damage(&place, "no signature");
@@ -260,29 +282,45 @@ fn check_labels(
     findings: &mut Findings,
 ) {
     let place = format!("shapes {}", shape.id);
-    let Some(versions) = findings.keep(reader.kept_versions(shape.id)) else { return };
+    let Some(versions) = findings.keep(reader.kept_versions(shape.id)) else {
+        return;
+    };
     let newest = versions.last().copied();
     if newest.is_none_or(|newest| newest != shape.version) {
-        let message = format!("version {}, but the newest labels are {newest:?}", shape.version);
+        let message = format!(
+            "version {}, but the newest labels are {newest:?}",
+            shape.version
+        );
         findings.damage(&place, message);
     }
     if versions.windows(2).any(|pair| pair[1] != pair[0] + 1) {
-        findings.damage(&place, format!("versions of its labels are missing among {versions:?}"));
+        findings.damage(
+            &place,
+            format!("versions of its labels are missing among {versions:?}"),
+        );
     }
     for version in versions {
         let Some(Some(labels)) = findings.keep(reader.labels_at(shape.id, version)) else {
             continue;
         };
         let mut lengths = vec![
-            ("polygon labels", labels.polygon_labels.len() as u64, shape.n_polygons),
-            ("polygon confidences", labels.polygon_confidence.len() as u64, shape.n_polygons),
+            (
+                "polygon labels",
+                labels.polygon_labels.len() as u64,
+                shape.n_polygons,
+            ),
+            (
+                "polygon confidences",
+                labels.polygon_confidence.len() as u64,
+                shape.n_polygons,
+            ),
         ];
         if let Some(described) = described {
             let n_faces = described.n_faces as u64;
             lengths.push(("proxy labels", labels.proxy_labels.len() as u64, n_faces));
-            let n_labels = (labels.proxy_probabilities.len() as u64).div_ceil(n_faces.max(1));
-            let expected = n_labels.max(1) * n_faces;
-            lengths.push(("proxy probabilities", labels.proxy_probabilities.len() as u64, expected));
+            let found = labels.proxy_probabilities.len() as u64;
+            let expected = found.div_ceil(n_faces.max(1)).max(1) * n_faces;
+            lengths.push(("proxy probabilities", found, expected));
         }
         for (what, found, expected) in lengths {
             if found != expected {
@@ -302,19 +340,31 @@ fn check_maps(
     findings: &mut Findings,
 ) -> Result<(), StoreError> {
     for (from, to) in keys::<ShapeId, ShapeId>(connection, "maps", "from_shape, to_shape")? {
-        let Some(Some(map)) = findings.keep(reader.map(from, to)) else { continue };
+        let Some(Some(map)) = findings.keep(reader.map(from, to)) else {
+            continue;
+        };
         let mut n_vertices = |id| {
             let shape = findings.keep(reader.shape(id)).flatten()?;
-            arrays.get(&shape.description_digest).map(|described| described.n_vertices)
+            arrays
+                .get(&shape.description_digest)
+                .map(|described| described.n_vertices)
         };
-        let (Some(n1), Some(n2)) = (n_vertices(from), n_vertices(to)) else { continue };
+        let (Some(n1), Some(n2)) = (n_vertices(from), n_vertices(to)) else {
+            continue;
+        };
         let place = format!("maps {from}, {to}");
         if map.p2p_21.len() != n2 {
             let found = map.p2p_21.len();
-            findings.damage(&place, format!("p2p_21 has {found} vertices, but the shape has {n2}"));
+            findings.damage(
+                &place,
+                format!("p2p_21 has {found} vertices, but the shape has {n2}"),
+            );
         }
         if let Some(vertex) = map.p2p_21.iter().find(|&&vertex| vertex as usize >= n1) {
-            findings.damage(&place, format!("p2p_21 names vertex {vertex}, but there are {n1}"));
+            findings.damage(
+                &place,
+                format!("p2p_21 names vertex {vertex}, but there are {n1}"),
+            );
         }
     }
     Ok(())
@@ -326,7 +376,9 @@ fn check_collections(
     findings: &mut Findings,
 ) -> Result<(), StoreError> {
     for (id, _) in keys::<_, i64>(connection, "collections", "id, stream_id")? {
-        let Some(Some(collection)) = findings.keep(reader.collection_by_id(id)) else { continue };
+        let Some(Some(collection)) = findings.keep(reader.collection_by_id(id)) else {
+            continue;
+        };
         findings.keep(reader.model(id));
         let largest_label = findings
             .keep(reader.labels(id))
@@ -342,7 +394,10 @@ fn check_collections(
             ("ordinal", largest_ordinal, collection.next_ordinal),
         ] {
             if let Some(largest) = largest.filter(|&largest| largest >= next) {
-                findings.damage(&place, format!("its next {what} is {next}, but {largest} is in use"));
+                findings.damage(
+                    &place,
+                    format!("its next {what} is {next}, but {largest} is in use"),
+                );
             }
         }
     }
@@ -376,7 +431,9 @@ fn check_jobs(
     findings: &mut Findings,
 ) -> Result<(), StoreError> {
     for (job, _) in keys::<u64, i64>(connection, "jobs", "id, created")? {
-        let Some(items) = findings.keep(reader.job_items(job)) else { continue };
+        let Some(items) = findings.keep(reader.job_items(job)) else {
+            continue;
+        };
         if let Some(at) = (0..items.len()).find(|&at| items[at].index as usize != at) {
             findings.damage(format!("jobs {job}"), format!("item {at} is missing"));
         }
@@ -391,7 +448,9 @@ fn check_jobs(
             );
         }
     }
-    for (client, request) in keys::<String, String>(connection, "requests", "client_id, request_id")? {
+    for (client, request) in
+        keys::<String, String>(connection, "requests", "client_id, request_id")?
+    {
         findings.keep(reader.request(&client, &request));
     }
     Ok(())
@@ -414,14 +473,21 @@ fn check_orphans(
     let reader = Reader::new(&connection);
     for folder in FOLDERS {
         let path = dir.join(folder);
-        for entry in RealDisk.files(&path).map_err(|e| StoreError::io(&path, e))? {
+        for entry in RealDisk
+            .files(&path)
+            .map_err(|e| StoreError::io(&path, e))?
+        {
             let file = relative(dir, &entry.path);
             // It may have been committed since the check began.
             if named.contains(file.as_str()) || reader.is_catalogued(&file).unwrap_or(false) {
                 continue;
             }
             let message = format!("{} bytes that no row names", entry.length);
-            findings.list.push(Finding { place: file, message, damage: false });
+            findings.list.push(Finding {
+                place: file,
+                message,
+                damage: false,
+            });
         }
     }
     Ok(())

@@ -13,10 +13,22 @@ use std::time::SystemTime;
 #[derive(Debug, Clone)]
 enum Op {
     CreateDir(PathBuf),
-    Create { path: PathBuf, inode: usize },
-    Write { inode: usize, bytes: Vec<u8> },
-    Sync { inode: usize },
-    Rename { from: PathBuf, to: PathBuf, inode: usize },
+    Create {
+        path: PathBuf,
+        inode: usize,
+    },
+    Write {
+        inode: usize,
+        bytes: Vec<u8>,
+    },
+    Sync {
+        inode: usize,
+    },
+    Rename {
+        from: PathBuf,
+        to: PathBuf,
+        inode: usize,
+    },
     SyncDir(PathBuf),
     Remove(PathBuf),
     RemoveDir(PathBuf),
@@ -75,6 +87,11 @@ impl MemDisk {
         self.mem().n_retried_syncs
     }
 
+    /// Another process goes on: what an earlier one saw fail is not its business.
+    pub(super) fn restart(&self) {
+        self.mem().failed_syncs.clear();
+    }
+
     /// The disk as it may be found after a crash that came after `n_logged` operations. What was
     /// synced is there; of the rest each write is kept, dropped or torn and each change of a name
     /// kept or dropped, independently of the others. Seed 0 drops everything that was not synced.
@@ -85,9 +102,15 @@ impl MemDisk {
         let mut luck = |durable: bool| durable || (seed != 0 && random.random_bool(0.5));
         let synced_after = |at: usize, is_it: &dyn Fn(&Op) -> bool| log[at..].iter().any(is_it);
         let dir_synced = |at: usize, path: &Path| {
-            synced_after(at, &|op| matches!(op, Op::SyncDir(dir) if Some(dir.as_path()) == path.parent()))
+            synced_after(
+                at,
+                &|op| matches!(op, Op::SyncDir(dir) if Some(dir.as_path()) == path.parent()),
+            )
         };
-        let mut image = Mem { contents: vec![Vec::new(); mem.contents.len()], ..Mem::default() };
+        let mut image = Mem {
+            contents: vec![Vec::new(); mem.contents.len()],
+            ..Mem::default()
+        };
         image.folders.insert("/l".into());
         for (at, op) in log.iter().enumerate() {
             match op {
@@ -118,7 +141,8 @@ impl MemDisk {
                     }
                 }
                 Op::Write { inode, bytes } => {
-                    let same = |op: &Op| matches!(op, Op::Sync { inode: synced } if synced == inode);
+                    let same =
+                        |op: &Op| matches!(op, Op::Sync { inode: synced } if synced == inode);
                     let content = &mut image.contents[*inode];
                     if luck(synced_after(at, &same)) {
                         content.extend(bytes);
@@ -136,7 +160,10 @@ impl MemDisk {
         // What lies in a folder that is gone is gone.
         let folders = image.folders.clone();
         let reachable = |path: &Path| {
-            path.ancestors().skip(1).take_while(|p| p.starts_with("/l")).all(|p| folders.contains(p))
+            path.ancestors()
+                .skip(1)
+                .take_while(|p| p.starts_with("/l"))
+                .all(|p| folders.contains(p))
         };
         image.folders.retain(|path| reachable(path));
         image.names.retain(|path, _| reachable(path));
@@ -144,7 +171,19 @@ impl MemDisk {
     }
 
     fn mem(&self) -> MutexGuard<'_, Mem> {
-        self.0.lock().expect("no test panics while it holds the disk")
+        self.0
+            .lock()
+            .expect("no test panics while it holds the disk")
+    }
+
+    /// Counts an operation that takes no space: a full disk does not keep it from working.
+    fn begin_without_space(&self) -> io::Result<MutexGuard<'_, Mem>> {
+        if self.mem().fault.is_some_and(|fault| fault.errno == ENOSPC) {
+            let mut mem = self.mem();
+            mem.n_operations += 1;
+            return Ok(mem);
+        }
+        self.begin()
     }
 
     /// Counts an operation; the error if it is to fail.
@@ -195,7 +234,10 @@ impl NewFile for MemFile<'_> {
         };
         let mut mem = self.disk.mem();
         mem.contents[self.inode].extend(bytes);
-        mem.log.push(Op::Write { inode: self.inode, bytes: bytes.to_vec() });
+        mem.log.push(Op::Write {
+            inode: self.inode,
+            bytes: bytes.to_vec(),
+        });
         result
     }
 
@@ -230,7 +272,10 @@ impl Disk for MemDisk {
         let inode = mem.contents.len();
         mem.contents.push(Vec::new());
         mem.names.insert(path.to_path_buf(), inode);
-        mem.log.push(Op::Create { path: path.to_path_buf(), inode });
+        mem.log.push(Op::Create {
+            path: path.to_path_buf(),
+            inode,
+        });
         drop(mem);
         Ok(Box::new(MemFile { disk: self, inode }))
     }
@@ -239,7 +284,11 @@ impl Disk for MemDisk {
         let mut mem = self.begin()?;
         let inode = mem.names.remove(from).ok_or_else(not_found)?;
         mem.names.insert(to.to_path_buf(), inode);
-        mem.log.push(Op::Rename { from: from.to_path_buf(), to: to.to_path_buf(), inode });
+        mem.log.push(Op::Rename {
+            from: from.to_path_buf(),
+            to: to.to_path_buf(),
+            inode,
+        });
         Ok(())
     }
 
@@ -250,14 +299,14 @@ impl Disk for MemDisk {
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {
-        let mut mem = self.begin()?;
+        let mut mem = self.begin_without_space()?;
         mem.names.remove(path).ok_or_else(not_found)?;
         mem.log.push(Op::Remove(path.to_path_buf()));
         Ok(())
     }
 
     fn remove_dir(&self, path: &Path) -> io::Result<()> {
-        let mut mem = self.begin()?;
+        let mut mem = self.begin_without_space()?;
         if mem.names.keys().any(|name| name.parent() == Some(path)) {
             return Err(io::ErrorKind::DirectoryNotEmpty.into());
         }
@@ -272,13 +321,13 @@ impl Disk for MemDisk {
     }
 
     fn read(&self, path: &Path) -> io::Result<Vec<u8>> {
-        let mem = self.begin()?;
+        let mem = self.begin_without_space()?;
         let inode = *mem.names.get(path).ok_or_else(not_found)?;
         Ok(mem.contents[inode].clone())
     }
 
     fn files(&self, dir: &Path) -> io::Result<Vec<Entry>> {
-        let mem = self.begin()?;
+        let mem = self.begin_without_space()?;
         let below = mem.names.iter().filter(|(path, _)| path.starts_with(dir));
         let entry = |(path, &inode): (&PathBuf, &usize)| Entry {
             path: path.clone(),

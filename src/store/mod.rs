@@ -37,11 +37,12 @@ pub use catalog::{Catalog, Reader, Tx};
 pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
 pub use health::Health;
-pub use objects::Objects;
 pub use mapped::MappedDescription;
+pub use objects::Objects;
 pub use rows::{
-    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow, MapRow,
-    NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId, ShapeRow,
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow,
+    MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId,
+    ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

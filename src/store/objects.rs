@@ -209,7 +209,10 @@ impl Objects {
         self.health.writable()?;
         let hex = digest.to_string();
         let folder = format!("{}/{}", kind.folder(), &hex[..2]);
-        let _publishing = self.publishing.lock().unwrap_or_else(PoisonError::into_inner);
+        let _publishing = self
+            .publishing
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         self.make_folder(kind.folder(), &folder)?;
 
         let blake3 = Digest::of(bytes);
@@ -259,7 +262,10 @@ impl Objects {
             return Ok(());
         }
         let path = self.root.join(folder);
-        let created = self.disk.create_dir(&path).map_err(|e| StoreError::io(&path, e))?;
+        let created = self
+            .disk
+            .create_dir(&path)
+            .map_err(|e| StoreError::io(&path, e))?;
         let parent = self.root.join(parent);
         let synced = self.disk.sync_dir(&parent).and_then(|()| match created {
             true => Ok(()),
@@ -268,11 +274,13 @@ impl Objects {
         if let Err(e) = synced {
             // Once the folder is gone again, the next attempt starts from the beginning; a folder
             // that was there before cannot be taken back.
-            return Err(if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
-                StoreError::io(&parent, e)
-            } else {
-                self.health.stop(format!("fsync {}: {e}", path.display()))
-            });
+            return Err(
+                if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
+                    StoreError::io(&parent, e)
+                } else {
+                    self.health.stop(format!("fsync {}: {e}", path.display()))
+                },
+            );
         }
         self.state().durable_folders.insert(folder.to_string());
         Ok(())
@@ -397,16 +405,25 @@ pub(super) fn read_original(
     };
     let (found, expected) = (stored.len() as u64, row.length);
     if found != expected {
-        return Err(damaged(&row.file, ArrayFileError::Length { found, expected }));
+        return Err(damaged(
+            &row.file,
+            ArrayFileError::Length { found, expected },
+        ));
     }
     let (found, expected) = (Digest::of(&stored), row.blake3);
     if found != expected {
-        return Err(damaged(&row.file, ArrayFileError::Digest { found, expected }));
+        return Err(damaged(
+            &row.file,
+            ArrayFileError::Digest { found, expected },
+        ));
     }
     let bytes = decompress(&stored, usize::MAX).map_err(|e| damaged(&row.file, e))?;
     let found = Digest::of(&bytes);
     if found != row.digest {
-        let message = format!("its content's BLAKE3 is {found}, but its name is {}", row.digest);
+        let message = format!(
+            "its content's BLAKE3 is {found}, but its name is {}",
+            row.digest
+        );
         return Err(damaged(&row.file, message));
     }
     Ok(bytes)

@@ -4,6 +4,8 @@ mod array_files;
 mod catalog;
 mod crash;
 mod damage;
+mod jobs;
+mod readers;
 
 use coseg::mesh::CleanReport;
 use coseg::pipeline::Description;
@@ -32,10 +34,14 @@ fn description(n: usize, seed: u32) -> Description {
             n_bridges: seed as usize,
             ..CleanReport::default()
         },
-        vertices: (0..n).map(|i| [value(i), value(i + n), value(i + 2 * n)]).collect(),
+        vertices: (0..n)
+            .map(|i| [value(i), value(i + n), value(i + 2 * n)])
+            .collect(),
         faces: (0..m as u32).map(|i| [i, i + 1, i + 2]).collect(),
         mass: values(n),
-        eigenvalues: (0..7).map(|i| f64::from(i) * 1.1 + f64::from(seed)).collect(),
+        eigenvalues: (0..7)
+            .map(|i| f64::from(i) * 1.1 + f64::from(seed))
+            .collect(),
         eigenvectors: values(n * 5),
         n_eigenvectors: 5,
         hks: values(n * 100),
@@ -46,6 +52,13 @@ fn description(n: usize, seed: u32) -> Description {
         polygon_area: values(n_polygons),
         signature: values(11),
     }
+}
+
+/// A new library in a folder of its own.
+fn opened() -> (tempfile::TempDir, Store) {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::open(&dir.path().join("deep/library")).expect("opens");
+    (dir, store)
 }
 
 const PARAMS: &str = r#"{"operator":"tufted","working_faces":2500}"#;
@@ -69,7 +82,9 @@ fn label_version(shape: &Description, version: u64, sequence: u64) -> LabelVersi
         sequence,
         cause: "added".into(),
         proxy_labels: (0..m).map(label).collect(),
-        proxy_confidence: (0..m).map(|i| confidence_to_u8(i as f32 / m as f32)).collect(),
+        proxy_probabilities: (0..3 * m)
+            .map(|i| confidence_to_u8(i as f32 / m as f32))
+            .collect(),
         polygon_labels: (0..n_polygons).map(label).collect(),
         polygon_confidence: vec![200; n_polygons],
         sources_json: r#"[{"shape":"a","version":1,"weight":1.0}]"#.into(),
@@ -96,7 +111,9 @@ fn add_shape(
     let bytes = format!("OFF {collection} {name} {seed}").into_bytes();
     let original = store.objects().put_original(&bytes)?;
     let digest = Digest::of_description(&original.digest, PARAMS, "1 scalar");
-    let arrays = store.objects().put_description(digest, &description, PARAMS)?;
+    let arrays = store
+        .objects()
+        .put_description(digest, &description, PARAMS)?;
     store.catalog().write(|tx| {
         tx.insert_object(&original)?;
         tx.insert_object(&arrays)?;
@@ -108,7 +125,12 @@ fn add_shape(
                     let id_in_use = tx.take_labels(id, 1)?;
                     assert_eq!(id_in_use, label);
                     let colour = [label as u8, 100, 200];
-                    let row = LabelRow { id: label, name: None, colour, merged_into: None };
+                    let row = LabelRow {
+                        id: label,
+                        name: None,
+                        colour,
+                        merged_into: None,
+                    };
                     tx.put_label(id, &row)?;
                 }
                 tx.append_event(id, "CollectionCreated", "{}")?;
@@ -131,11 +153,13 @@ fn add_shape(
             signature: description.signature.clone(),
             stored_bytes: original.length + arrays.length,
         })?;
-        let sequence = tx.append_event(collection, "ShapeAdded", &format!("{{\"shape\":{name:?}}}"))?;
+        let sequence =
+            tx.append_event(collection, "ShapeAdded", &format!("{{\"shape\":{name:?}}}"))?;
         let labels = label_version(&description, 1, sequence);
         tx.put_labels(shape, &labels, &summary(0, &[0, seed % 3]).distinct())?;
         tx.put_stats(shape, 0, &seed.to_le_bytes())?;
-        if let Some(before) = tx.shapes(collection, ordinal.saturating_sub(2), 1, None)?.first() {
+        let before = tx.shapes(collection, ordinal.saturating_sub(2), 1, None)?;
+        if let Some(before) = before.first().filter(|before| before.id != shape) {
             let n1 = tx.object_vertices(store, before.description_digest);
             tx.put_map(&MapRow {
                 from: before.id,
@@ -143,7 +167,9 @@ fn add_shape(
                 k1: 2,
                 k2: 3,
                 c_12: vec![0.5, -0.5, 0.25, 1.0, 0.0, -1.0],
-                p2p_21: (0..description.vertices.len()).map(|i| (i % n1) as u32).collect(),
+                p2p_21: (0..description.vertices.len())
+                    .map(|i| (i % n1) as u32)
+                    .collect(),
                 quality_json: "{}".into(),
             })?;
         }
@@ -167,7 +193,10 @@ fn add_shape(
 
 /// The row of a collection that must be there.
 fn collection_id(store: &Store, name: &str) -> CollectionId {
-    let row = store.catalog().read(|r| r.collection(name)).expect("readable");
+    let row = store
+        .catalog()
+        .read(|r| r.collection(name))
+        .expect("readable");
     row.expect("the collection is there").id
 }
 
@@ -190,8 +219,13 @@ trait ObjectVertices {
 impl ObjectVertices for coseg::store::Tx<'_> {
     fn object_vertices(&self, store: &Store, digest: Digest) -> usize {
         use coseg::store::rows::ObjectKind;
-        let row = self.object(ObjectKind::Description, &digest).expect("readable");
-        let mapped = store.objects().open_description(&row.expect("catalogued")).expect("whole");
+        let row = self
+            .object(ObjectKind::Description, &digest)
+            .expect("readable");
+        let mapped = store
+            .objects()
+            .open_description(&row.expect("catalogued"))
+            .expect("whole");
         mapped.view().vertices.len()
     }
 }

@@ -7,6 +7,7 @@
 mod collections;
 mod jobs;
 mod labels;
+pub(in crate::store) mod log;
 mod maps;
 mod reader;
 pub(crate) mod schema;
@@ -32,6 +33,10 @@ const KEPT_READERS: usize = 4;
 /// The write-ahead log is copied into the file whenever it has grown by this much.
 const CHECKPOINT_BYTES: u64 = 4 << 20;
 
+/// Catalogs up to this size have their structure checked when they are opened, which takes a few
+/// tenths of a second; larger ones are left to `check`.
+const CHECKED_AT_OPEN_BYTES: u64 = 64 << 20;
+
 /// The catalog of one library.
 #[derive(Debug)]
 pub struct Catalog {
@@ -52,6 +57,14 @@ impl Catalog {
     /// Opens the catalog at `path`, which is created if it is missing. The caller holds the
     /// library's lock.
     pub fn open(path: &Path, health: Health) -> Result<Self, StoreError> {
+        let log = log_of(path);
+        if let Some(message) = log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
+            // Opening would forget the commits behind the damage for good.
+            return Err(StoreError::Damaged {
+                path: log.display().to_string(),
+                message,
+            });
+        }
         let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
             | OpenFlags::SQLITE_OPEN_CREATE
             | OpenFlags::SQLITE_OPEN_NO_MUTEX;
@@ -74,6 +87,7 @@ impl Catalog {
         connection.pragma_update(None, "cache_spill", false)?;
         connection.pragma_update(None, "wal_autocheckpoint", 0)?;
         connection.set_prepared_statement_cache_capacity(128);
+        refuse_writes_if_damaged(&connection, path, &health)?;
         let writer = Writer {
             connection,
             checkpoint_at: CHECKPOINT_BYTES,
@@ -88,7 +102,7 @@ impl Catalog {
     }
 
     /// Runs `change` in a transaction, which is durable when this returns `Ok`, and leaves no trace
-    /// otherwise.
+    /// otherwise. Not to be called within a change: there is one writer, and it is busy.
     pub fn write<T, E: From<StoreError>>(
         &self,
         change: impl FnOnce(&Tx<'_>) -> Result<T, E>,
@@ -132,9 +146,7 @@ impl Catalog {
 
     /// Copies the write-ahead log into the file as far as readers allow.
     fn checkpoint_if_due(&self, writer: &mut Writer) -> Result<(), StoreError> {
-        let mut log = self.path.clone().into_os_string();
-        log.push("-wal");
-        let length = std::fs::metadata(&log).map_or(0, |metadata| metadata.len());
+        let length = std::fs::metadata(log_of(&self.path)).map_or(0, |metadata| metadata.len());
         if length < writer.checkpoint_at {
             return Ok(());
         }
@@ -171,6 +183,38 @@ impl Catalog {
     }
 }
 
+/// Looks for structural damage, which a lookup may not notice: a row that a broken index hides seems
+/// not to be there. Writing on such ground (a request that seems new) would make it worse.
+fn refuse_writes_if_damaged(
+    connection: &Connection,
+    path: &Path,
+    health: &Health,
+) -> Result<(), StoreError> {
+    let length = std::fs::metadata(path)
+        .map_err(|e| StoreError::io(path, e))?
+        .len();
+    if length > CHECKED_AT_OPEN_BYTES {
+        return Ok(());
+    }
+    let found = connection
+        .query_row("PRAGMA integrity_check(1)", [], |row| {
+            row.get::<_, String>(0)
+        })
+        .map_err(StoreError::from);
+    match found {
+        Ok(found) if found == "ok" => Ok(()),
+        Ok(found) => {
+            health.stop(format!("{} is damaged: {found}", path.display()));
+            Ok(())
+        }
+        Err(error) if error.is_damage() => {
+            health.stop(error.to_string());
+            Ok(())
+        }
+        Err(error) => Err(error),
+    }
+}
+
 /// Opens a catalog for reading only, beside a process that may be writing it.
 pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
@@ -180,6 +224,13 @@ pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
     connection.set_prepared_statement_cache_capacity(64);
     schema::check_format(&connection, &path.display().to_string())?;
     Ok(connection)
+}
+
+/// The write-ahead log of the catalog at `path`.
+pub(super) fn log_of(path: &Path) -> PathBuf {
+    let mut log = path.to_path_buf().into_os_string();
+    log.push("-wal");
+    log.into()
 }
 
 /// The catalog's path in a library folder.
@@ -195,8 +246,13 @@ mod tests {
     fn opened() -> (tempfile::TempDir, Catalog, CollectionId) {
         let dir = tempfile::tempdir().expect("a folder");
         let catalog = Catalog::open(&path_in(dir.path()), Health::default()).expect("opens");
-        let new = NewCollection { name: "a".into(), ..NewCollection::default() };
-        let id = catalog.write(|tx| tx.insert_collection(&new)).expect("inserted");
+        let new = NewCollection {
+            name: "a".into(),
+            ..NewCollection::default()
+        };
+        let id = catalog
+            .write(|tx| tx.insert_collection(&new))
+            .expect("inserted");
         (dir, catalog, id)
     }
 
@@ -222,7 +278,9 @@ mod tests {
         assert!(matches!(full, Err(StoreError::NoSpace { .. })), "{full:?}");
         assert_eq!(state(&catalog, id), b"");
         limit(1 << 20);
-        catalog.write(|tx| tx.set_state(id, &big)).expect("there is space again");
+        catalog
+            .write(|tx| tx.set_state(id, &big))
+            .expect("there is space again");
         assert_eq!(state(&catalog, id), big);
     }
 
@@ -236,7 +294,10 @@ mod tests {
         let failed = catalog.failed(rusqlite::Error::SqliteFailure(error, None));
         assert!(matches!(failed, StoreError::ReadOnly { .. }), "{failed}");
         let refused = catalog.write(|tx| tx.set_state(id, b"x"));
-        assert!(matches!(refused, Err(StoreError::ReadOnly { .. })), "{refused:?}");
+        assert!(
+            matches!(refused, Err(StoreError::ReadOnly { .. })),
+            "{refused:?}"
+        );
         assert_eq!(state(&catalog, id), b"");
     }
 
@@ -246,7 +307,9 @@ mod tests {
         let log = catalog.path.with_file_name("catalog.db-wal");
         let write = || {
             for i in 0..40_u8 {
-                catalog.write(|tx| tx.set_state(id, &vec![i; 1 << 18])).expect("written");
+                catalog
+                    .write(|tx| tx.set_state(id, &vec![i; 1 << 18]))
+                    .expect("written");
             }
         };
         let length = || std::fs::metadata(&log).expect("there").len();

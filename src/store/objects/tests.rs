@@ -5,8 +5,9 @@ use crate::store::faulty::{EIO, ENOSPC, Fault, MemDisk};
 
 /// What the tests put: two digests share a folder, one content comes twice.
 fn contents() -> Vec<Vec<u8>> {
-    let mut contents: Vec<Vec<u8>> =
-        (0..9_u8).map(|i| vec![i; usize::from(i) * 40 + 1].repeat(3)).collect();
+    let mut contents: Vec<Vec<u8>> = (0..9_u8)
+        .map(|i| vec![i; usize::from(i) * 40 + 1].repeat(3))
+        .collect();
     let prefix = |bytes: &[u8]| Digest::of(bytes).0[0];
     let neighbour = (0_u32..)
         .map(|i| i.to_le_bytes().to_vec())
@@ -18,7 +19,11 @@ fn contents() -> Vec<Vec<u8>> {
 }
 
 fn opened(disk: &Arc<MemDisk>) -> Result<Objects, StoreError> {
-    Objects::open(Arc::clone(disk) as Arc<dyn Disk>, Path::new("/l"), Health::default())
+    Objects::open(
+        Arc::clone(disk) as Arc<dyn Disk>,
+        Path::new("/l"),
+        Health::default(),
+    )
 }
 
 fn whole(disk: &MemDisk, row: &ObjectRow, bytes: &[u8]) -> bool {
@@ -43,7 +48,11 @@ fn what_was_put_survives_a_crash_at_every_operation() {
             let image = Arc::new(disk.after_crash(n_logged, seed));
             for (at, row, bytes) in &acknowledged {
                 let there = whole(&image, row, bytes);
-                assert!(there || *at > n_logged, "{} lost at {n_logged}, {seed}", row.file);
+                assert!(
+                    there || *at > n_logged,
+                    "{} lost at {n_logged}, {seed}",
+                    row.file
+                );
                 // A file in its place is complete, acknowledged or not.
                 assert!(there || !image.exists(&Path::new("/l").join(&row.file)));
             }
@@ -100,10 +109,17 @@ fn run_with(fault: Fault) {
     disk.set_fault(None);
     let objects = match opened_at_once {
         Ok(objects) => objects,
-        Err(_) => opened(&disk).expect("opens once the fault is gone"),
+        Err(_) => {
+            disk.restart();
+            opened(&disk).expect("opens once the fault is gone")
+        }
     };
     for (row, bytes) in &acknowledged {
-        assert_eq!(objects.original(row).expect("reads are served"), *bytes, "{fault:?}");
+        assert_eq!(
+            objects.original(row).expect("reads are served"),
+            *bytes,
+            "{fault:?}"
+        );
     }
     for bytes in contents() {
         match objects.put_original(&bytes) {
@@ -116,6 +132,7 @@ fn run_with(fault: Fault) {
     }
     assert_eq!(disk.n_retried_syncs(), 0, "{fault:?}");
     // A fault that made it stop is over for the next process.
+    disk.restart();
     let next = opened(&disk).expect("opens");
     for bytes in contents() {
         let row = next.put_original(&bytes).expect("stored");
@@ -135,7 +152,11 @@ fn every_operation_may_fail_once_or_for_ever() {
     for at in 0..n_operations {
         for errno in [EIO, ENOSPC] {
             for for_ever in [false, true] {
-                run_with(Fault { at, errno, for_ever });
+                run_with(Fault {
+                    at,
+                    errno,
+                    for_ever,
+                });
             }
         }
     }
@@ -145,18 +166,41 @@ fn every_operation_may_fail_once_or_for_ever() {
 fn other_bytes_under_a_taken_name_get_a_name_of_their_own() {
     let disk = Arc::new(MemDisk::new());
     let objects = opened(&disk).expect("opens");
-    let first = Description { area: 1.0, ..Description::default() };
-    let second = Description { area: 2.0, ..Description::default() };
+    let first = Description {
+        area: 1.0,
+        ..Description::default()
+    };
+    let second = Description {
+        area: 2.0,
+        ..Description::default()
+    };
     let digest = Digest::of(b"one digest");
-    let one = objects.put_description(digest, &first, "{}").expect("stored");
-    let two = objects.put_description(digest, &second, "{}").expect("stored");
+    let one = objects
+        .put_description(digest, &first, "{}")
+        .expect("stored");
+    let two = objects
+        .put_description(digest, &second, "{}")
+        .expect("stored");
     assert_ne!(one.file, two.file);
     assert_ne!(one.blake3, two.blake3);
-    assert_eq!(objects.put_description(digest, &first, "{}").expect("stored"), one);
-    assert_eq!(objects.put_description(digest, &second, "{}").expect("stored"), two);
+    assert_eq!(
+        objects
+            .put_description(digest, &first, "{}")
+            .expect("stored"),
+        one
+    );
+    assert_eq!(
+        objects
+            .put_description(digest, &second, "{}")
+            .expect("stored"),
+        two
+    );
     for row in [&one, &two] {
         let bytes = disk.read(&Path::new("/l").join(&row.file)).expect("there");
-        assert_eq!((bytes.len() as u64, Digest::of(&bytes)), (row.length, row.blake3));
+        assert_eq!(
+            (bytes.len() as u64, Digest::of(&bytes)),
+            (row.length, row.blake3)
+        );
     }
 }
 
@@ -167,8 +211,13 @@ fn opened_files_stay_mapped_within_the_bound() {
     let objects = Objects::open(disk, dir.path(), Health::default()).expect("opens");
     let rows: Vec<_> = (0..4_u8)
         .map(|i| {
-            let one = Description { area: f64::from(i), ..Description::default() };
-            objects.put_description(Digest::of(&[i]), &one, "{}").expect("stored")
+            let one = Description {
+                area: f64::from(i),
+                ..Description::default()
+            };
+            objects
+                .put_description(Digest::of(&[i]), &one, "{}")
+                .expect("stored")
         })
         .collect();
     let length = rows[0].length as usize;
@@ -177,9 +226,15 @@ fn opened_files_stay_mapped_within_the_bound() {
         objects.open_description(&rows[at]).expect("whole");
     }
     let cached = |row: &ObjectRow| objects.cached(&row.file, row.blake3).is_some();
-    assert_eq!(rows.iter().map(cached).collect::<Vec<_>>(), [true, false, true, false]);
+    assert_eq!(
+        rows.iter().map(cached).collect::<Vec<_>>(),
+        [true, false, true, false]
+    );
     // A row with another digest never gets what an earlier one opened.
-    let other = ObjectRow { blake3: rows[1].blake3, ..rows[0].clone() };
+    let other = ObjectRow {
+        blake3: rows[1].blake3,
+        ..rows[0].clone()
+    };
     assert!(objects.open_description(&other).is_err());
     objects.set_cache_bytes(0);
     assert!(!cached(&rows[0]));

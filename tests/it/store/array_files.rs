@@ -38,7 +38,11 @@ fn a_description_reads_back_bit_for_bit() {
     odd.eigenvalues[0] = -1e-300;
     odd.area = 0.1 + 0.2;
     let file = write_description(&odd, PARAMS).expect("consistent");
-    assert_eq!(file, write_description(&odd, PARAMS).expect("consistent"), "same bytes");
+    assert_eq!(
+        file,
+        write_description(&odd, PARAMS).expect("consistent"),
+        "same bytes"
+    );
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("odd.safetensors");
     std::fs::write(&path, &file).expect("written");
@@ -58,7 +62,13 @@ fn a_description_reads_back_bit_for_bit() {
 
 #[test]
 fn the_smallest_description_reads_back() {
-    for empty in [Description::default(), Description { area: 1.0, ..description(3, 0) }] {
+    for empty in [
+        Description::default(),
+        Description {
+            area: 1.0,
+            ..description(3, 0)
+        },
+    ] {
         let file = write_description(&empty, "").expect("consistent");
         assert_eq!(open_bytes(&file).expect("whole").to_description(), empty);
     }
@@ -74,7 +84,7 @@ fn the_file_is_plain_safetensors() {
     assert_eq!(header["__metadata__"]["format"], "1");
     assert_eq!(header["__metadata__"]["params"], PARAMS);
     assert_eq!(header["__metadata__"]["area"], "12.25");
-    assert_eq!(header["__metadata__"]["report.n_bridges"], "9");
+    assert_eq!(header["__metadata__"]["n_bridges"], "9");
     let expected = [
         ("vertices", "F32", json!([21, 3])),
         ("faces", "U32", json!([19, 3])),
@@ -94,10 +104,17 @@ fn the_file_is_plain_safetensors() {
         assert_eq!(header[name]["shape"], shape, "{name}");
     }
     let offsets = &header["faces"]["data_offsets"];
-    let (begin, end) = (offsets[0].as_u64().expect("a"), offsets[1].as_u64().expect("b"));
+    let (begin, end) = (
+        offsets[0].as_u64().expect("a"),
+        offsets[1].as_u64().expect("b"),
+    );
     let faces = &data[begin as usize..end as usize];
-    let expected: Vec<u8> =
-        description.faces.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    let expected: Vec<u8> = description
+        .faces
+        .as_flattened()
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .collect();
     assert_eq!(faces, expected);
 }
 
@@ -115,7 +132,9 @@ a, b = header["eigenvalues"]["data_offsets"]
 v = np.memmap(path, "<f8", "r", 8 + n + a, tuple(header["eigenvalues"]["shape"]))
 print(float(v[1]))
 "#;
-    let python = std::process::Command::new("python3").args(["-c", "import numpy"]).output();
+    let python = std::process::Command::new("python3")
+        .args(["-c", "import numpy"])
+        .output();
     if !python.is_ok_and(|output| output.status.success()) {
         println!("skipped: no python3 with numpy");
         return;
@@ -124,20 +143,34 @@ print(float(v[1]))
     let path = dir.path().join("a.safetensors");
     let file = write_description(&description(9, 0), PARAMS).expect("consistent");
     std::fs::write(&path, file).expect("written");
-    let run = std::process::Command::new("python3").args(["-c", script]).arg(&path).output();
+    let run = std::process::Command::new("python3")
+        .args(["-c", script])
+        .arg(&path)
+        .output();
     let output = run.expect("python3 runs");
-    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), "1.1", "{output:?}");
+    assert_eq!(
+        String::from_utf8_lossy(&output.stdout).trim(),
+        "1.1",
+        "{output:?}"
+    );
 }
 
 #[test]
 fn a_file_cut_anywhere_is_refused() {
     let file = write_description(&description(5, 1), PARAMS).expect("consistent");
     for end in 0..file.len() {
-        assert!(open_bytes(&file[..end]).is_err(), "cut at {end} of {}", file.len());
+        assert!(
+            open_bytes(&file[..end]).is_err(),
+            "cut at {end} of {}",
+            file.len()
+        );
     }
     let mut longer = file.clone();
     longer.push(0);
-    assert!(matches!(open_bytes(&longer), Err(ArrayFileError::Header(_))));
+    assert!(matches!(
+        open_bytes(&longer),
+        Err(ArrayFileError::Header(_))
+    ));
 }
 
 #[test]
@@ -151,7 +184,10 @@ fn length_and_digest_are_the_catalogs() {
     let open = |length| MappedDescription::open(&path, length, Some(digest));
     assert!(open(length).is_ok());
     for wrong in [0, length - 1, length + 1, length + 4096] {
-        assert!(matches!(open(wrong), Err(ArrayFileError::Length { .. })), "{wrong}");
+        assert!(
+            matches!(open(wrong), Err(ArrayFileError::Length { .. })),
+            "{wrong}"
+        );
     }
     // Swapped for another whole file, here padded to the same length by its parameters.
     assert_eq!(other.len(), file.len());
@@ -172,11 +208,19 @@ fn every_flipped_bit_is_noticed() {
     for at in 0..file.len() {
         file[at] ^= 1 << (at % 8);
         std::fs::write(&path, &file).expect("written");
-        assert!(MappedDescription::open(&path, length, Some(digest)).is_err(), "byte {at}");
+        assert!(
+            MappedDescription::open(&path, length, Some(digest)).is_err(),
+            "byte {at}"
+        );
         // Without the digest nothing may panic, whatever is found.
         if let Ok(mapped) = MappedDescription::open(&path, length, None) {
             let view = mapped.view();
-            assert!(view.faces.as_flattened().iter().all(|&v| (v as usize) < view.vertices.len()));
+            assert!(
+                view.faces
+                    .as_flattened()
+                    .iter()
+                    .all(|&v| (v as usize) < view.vertices.len())
+            );
         }
         file[at] ^= 1 << (at % 8);
     }
@@ -186,27 +230,39 @@ fn every_flipped_bit_is_noticed() {
 fn headers_that_lie_are_refused() {
     let file = write_description(&description(6, 1), PARAMS).expect("consistent");
     let (header, data) = parts(&file);
-    assert!(open_bytes(&joined(&header, &data)).is_ok(), "the unchanged header is accepted");
+    assert!(
+        open_bytes(&joined(&header, &data)).is_ok(),
+        "the unchanged header is accepted"
+    );
     let changed = |change: &dyn Fn(&mut Value)| {
         let mut header = header.clone();
         change(&mut header);
-        open_bytes(&joined(&header, &data)).expect_err("a lie").to_string()
+        open_bytes(&joined(&header, &data))
+            .expect_err("a lie")
+            .to_string()
     };
-    let lies: [(&str, &dyn Fn(&mut Value)); 17] = [
+    type Lie = dyn Fn(&mut Value);
+    let lies: [(&str, &Lie); 17] = [
         ("dtype", &|h| h["mass"]["dtype"] = json!("U32")),
         ("dtype", &|h| h["eigenvalues"]["dtype"] = json!("I64")),
         ("dtype", &|h| h["faces"]["dtype"] = json!("F32")),
         ("header", &|h| h["mass"]["dtype"] = json!("F64")),
         ("header", &|h| h["mass"]["dtype"] = json!("X9")),
         ("header", &|h| h["mass"]["shape"] = json!([7])),
-        ("header", &|h| h["mass"]["shape"] = json!([u64::MAX, u64::MAX])),
+        ("header", &|h| {
+            h["mass"]["shape"] = json!([u64::MAX, u64::MAX])
+        }),
         ("header", &|h| h["mass"]["shape"] = json!([-1])),
         ("shape", &|h| h["vertices"]["shape"] = json!([9, 2])),
         ("shape", &|h| h["vertices"]["shape"] = json!([18])),
         ("shape", &|h| h["mass"]["shape"] = json!([6, 1])),
         ("shape", &|h| h["hks"]["shape"] = json!([100, 6])),
-        ("header", &|h| h["signature"]["data_offsets"][1] = json!(1 << 40)),
-        ("header", &|h| h["vertices"]["data_offsets"] = json!([0, 72])),
+        ("header", &|h| {
+            h["signature"]["data_offsets"][1] = json!(1_u64 << 40)
+        }),
+        ("header", &|h| {
+            h["vertices"]["data_offsets"] = json!([0, 72])
+        }),
         ("missing", &|h| h["signature_"] = h["signature"].clone()),
         ("metadata", &|h| h["__metadata__"]["area"] = json!("wide")),
         ("format 2", &|h| h["__metadata__"]["format"] = json!("2")),
@@ -214,18 +270,27 @@ fn headers_that_lie_are_refused() {
     for (at, (message, lie)) in lies.iter().enumerate() {
         let lie_with_removal = |h: &mut Value| {
             lie(h);
-            if let Some(map) = h.as_object_mut().filter(|map| map.contains_key("signature_")) {
+            if let Some(map) = h
+                .as_object_mut()
+                .filter(|map| map.contains_key("signature_"))
+            {
                 map.remove("signature_");
                 map.remove("signature");
             }
         };
         let error = changed(&lie_with_removal);
         let tail_lost = *message == "missing" && error.contains("header");
-        assert!(error.contains(message) || tail_lost, "{at}: {error} should speak of {message}");
+        assert!(
+            error.contains(message) || tail_lost,
+            "{at}: {error} should speak of {message}"
+        );
     }
-    for key in ["format", "area", "params", "report.n_bridges"] {
+    for key in ["format", "area", "params", "n_bridges"] {
         let error = changed(&|h| {
-            h["__metadata__"].as_object_mut().expect("a map").remove(key);
+            h["__metadata__"]
+                .as_object_mut()
+                .expect("a map")
+                .remove(key);
         });
         assert!(error.contains(key), "{error}");
     }
@@ -243,24 +308,48 @@ fn a_missing_or_additional_array_is_refused() {
     header["other"] = last;
     header.as_object_mut().expect("a map").remove("signature");
     let error = open_bytes(&joined(&header, &data)).expect_err("another name");
-    assert!(matches!(&error, ArrayFileError::Unexpected { name } if name == "other"), "{error}");
+    assert!(
+        matches!(&error, ArrayFileError::Unexpected { name } if name == "other"),
+        "{error}"
+    );
     header.as_object_mut().expect("a map").remove("other");
     let data = &data[..data.len() - whole.signature.len() * 4];
     let error = open_bytes(&joined(&header, data)).expect_err("one too few");
-    assert!(matches!(error, ArrayFileError::Missing { name: "signature" }), "{error}");
+    assert!(
+        matches!(error, ArrayFileError::Missing { name: "signature" }),
+        "{error}"
+    );
 }
 
 #[test]
 fn a_header_that_is_not_text_or_not_aligned_is_refused() {
     let file = write_description(&description(6, 1), PARAMS).expect("consistent");
     let mut not_text = file.clone();
-    let at = file.windows(4).position(|bytes| bytes == b"mass").expect("a name");
+    let at = file
+        .windows(4)
+        .position(|bytes| bytes == b"mass")
+        .expect("a name");
     not_text[at] = 0xff;
-    assert!(matches!(open_bytes(&not_text), Err(ArrayFileError::Header(_))));
-    for length in [0, 1, 7, u64::MAX, u64::MAX / 2, 1 << 62, 100_000_000, 100_000_001] {
+    assert!(matches!(
+        open_bytes(&not_text),
+        Err(ArrayFileError::Header(_))
+    ));
+    for length in [
+        0,
+        1,
+        7,
+        u64::MAX,
+        u64::MAX / 2,
+        1 << 62,
+        100_000_000,
+        100_000_001,
+    ] {
         let mut lying = file.clone();
         lying[..8].copy_from_slice(&length.to_le_bytes());
-        assert!(matches!(open_bytes(&lying), Err(ArrayFileError::Header(_))), "{length}");
+        assert!(
+            matches!(open_bytes(&lying), Err(ArrayFileError::Header(_))),
+            "{length}"
+        );
     }
     // One more space in the header: still safetensors, but eigenvalues begin at an odd byte.
     let (header, data) = parts(&file);
@@ -283,12 +372,16 @@ fn indices_out_of_range_are_refused_when_written_and_when_read() {
             "patches" => bad.patches[0] = 4,
             _ => bad.face_map[8] = u32::MAX,
         }
-        let error = write_description(&bad, PARAMS).expect_err("out of range").to_string();
+        let error = write_description(&bad, PARAMS)
+            .expect_err("out of range")
+            .to_string();
         assert!(error.starts_with(name), "{error}");
         let mut data = data.clone();
         let begin = header[name]["data_offsets"][0].as_u64().expect("a number") as usize;
         data[begin..begin + 4].copy_from_slice(&6_u32.to_le_bytes());
-        let error = open_bytes(&joined(&header, &data)).expect_err("out of range").to_string();
+        let error = open_bytes(&joined(&header, &data))
+            .expect_err("out of range")
+            .to_string();
         assert!(error.starts_with(&format!("{name}[0] is 6")), "{error}");
     }
 }
@@ -307,6 +400,9 @@ fn arrays_that_do_not_fit_each_other_are_not_written() {
         let mut bad = description(6, 1);
         spoil(&mut bad);
         let error = write_description(&bad, PARAMS).expect_err("does not fit");
-        assert!(matches!(error, ArrayFileError::Shape { .. }), "{at}: {error}");
+        assert!(
+            matches!(error, ArrayFileError::Shape { .. }),
+            "{at}: {error}"
+        );
     }
 }

@@ -1,25 +1,15 @@
-//! The catalog: every row reads back, transactions are whole, readers do not wait.
+//! The catalog: every row reads back, transactions are whole.
 
 use super::{
-    add_shape, collection_id, description, label_version, new_collection, summary,
+    add_shape, collection_id, description, label_version, new_collection, opened, summary,
 };
 use coseg::store::catalog::KEPT_LABEL_VERSIONS;
 use coseg::store::rows::{
-    ItemStatus, LabelRow, MapRow, NewJobItem, ObjectKind, RequestRow, confidence_from_u8,
-    confidence_to_u8,
+    LabelRow, MapRow, NewJobItem, ObjectKind, confidence_from_u8, confidence_to_u8,
 };
 use coseg::store::{Digest, Store, StoreError};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
-use std::time::Duration;
 
 type Result<T> = std::result::Result<T, StoreError>;
-
-fn opened() -> (tempfile::TempDir, Store) {
-    let dir = tempfile::tempdir().expect("a folder");
-    let store = Store::open(&dir.path().join("deep/library")).expect("opens");
-    (dir, store)
-}
 
 #[test]
 fn a_shape_reads_back_after_reopening() -> Result<()> {
@@ -33,14 +23,24 @@ fn a_shape_reads_back_after_reopening() -> Result<()> {
     store.catalog().read(|r| -> Result<()> {
         assert_eq!(r.library_id()?, library_id);
         let collection = r.collection("chairs")?.expect("there");
-        assert_eq!(r.collections()?, [collection.clone()]);
-        assert_eq!(r.collection_by_id(collection.id)?.as_ref(), Some(&collection));
+        assert_eq!(r.collections()?, std::slice::from_ref(&collection));
         assert_eq!(
-            (collection.n_parts, collection.up.as_str(), collection.operator.as_str()),
+            r.collection_by_id(collection.id)?.as_ref(),
+            Some(&collection)
+        );
+        assert_eq!(
+            (
+                collection.n_parts,
+                collection.up.as_str(),
+                collection.operator.as_str()
+            ),
             (Some(3), "+y", "tufted")
         );
         assert_eq!((collection.sequence, collection.next_ordinal), (3, 3));
-        assert_eq!((collection.next_label, collection.state.as_slice()), (3, &b"state"[..]));
+        assert_eq!(
+            (collection.next_label, collection.state.as_slice()),
+            (3, &b"state"[..])
+        );
         assert_eq!(r.model(collection.id)?.as_deref(), Some(&[7; 1000][..]));
         let shape = r.shape_by_name(collection.id, "two")?.expect("there");
         assert_eq!(r.shape(second)?.as_ref(), Some(&shape));
@@ -49,7 +49,10 @@ fn a_shape_reads_back_after_reopening() -> Result<()> {
         assert_eq!(shape.n_polygons, expected.face_map.len() as u64);
         assert_eq!(shape.area, expected.area);
         assert_eq!(shape.format, "off");
-        assert_eq!(r.signature(second)?.as_deref(), Some(&expected.signature[..]));
+        assert_eq!(
+            r.signature(second)?.as_deref(),
+            Some(&expected.signature[..])
+        );
         let labels = label_version(&expected, 1, 3);
         assert_eq!(r.newest_labels(second)?.as_ref(), Some(&labels));
         assert_eq!(r.labels_at(second, 1)?, Some(labels));
@@ -61,22 +64,37 @@ fn a_shape_reads_back_after_reopening() -> Result<()> {
         assert_eq!(r.maps_into(second)?, [map]);
         assert_eq!(r.mapped_from(first)?, [second]);
         let refs = r.descriptions(collection.id)?;
-        assert_eq!(refs.iter().map(|d| d.name.as_str()).collect::<Vec<_>>(), ["one", "two"]);
+        assert_eq!(
+            refs.iter().map(|d| d.name.as_str()).collect::<Vec<_>>(),
+            ["one", "two"]
+        );
         let mapped = store.objects().open_description(&refs[1].object)?;
         assert_eq!(mapped.to_description(), expected);
-        let original = r.object(ObjectKind::Original, &shape.content_digest)?.expect("there");
+        let original = r
+            .object(ObjectKind::Original, &shape.content_digest)?
+            .expect("there");
         assert_eq!(store.objects().original(&original)?, b"OFF chairs two 2");
         let mut seen = Vec::new();
-        r.each_signature(collection.id, |shape, signature| seen.push((shape, signature.len())))?;
+        r.each_signature(collection.id, |shape, signature| {
+            seen.push((shape, signature.len()))
+        })?;
         assert_eq!(seen, [(first, 11), (second, 11)]);
         let mut seen = Vec::new();
-        r.each_stats(collection.id, |shape, epoch, stats| seen.push((shape, epoch, stats[0])))?;
+        r.each_stats(collection.id, |shape, epoch, stats| {
+            seen.push((shape, epoch, stats[0]))
+        })?;
         assert_eq!(seen, [(first, 0, 1), (second, 0, 2)]);
         let events = r.events_since("chairs", 1, 10)?;
-        assert_eq!(events.iter().map(|e| e.sequence).collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(
+            events.iter().map(|e| e.sequence).collect::<Vec<_>>(),
+            [2, 3]
+        );
         assert_eq!(events[1].payload_json, r#"{"shape":"two"}"#);
         let totals = r.totals()?;
-        assert_eq!((totals.n_collections, totals.n_shapes, totals.n_queued), (1, 2, 2));
+        assert_eq!(
+            (totals.n_collections, totals.n_shapes, totals.n_queued),
+            (1, 2, 2)
+        );
         assert!(totals.object_bytes > 0 && totals.catalog_bytes > 0);
         Ok(())
     })
@@ -92,7 +110,11 @@ fn shapes_come_in_pages_and_by_label() -> Result<()> {
     let id = collection_id(&store, "chairs");
     let names = |after, limit, label| {
         let shapes = store.catalog().read(|r| r.shapes(id, after, limit, label));
-        shapes.expect("readable").into_iter().map(|shape| shape.name).collect::<Vec<_>>()
+        shapes
+            .expect("readable")
+            .into_iter()
+            .map(|shape| shape.name)
+            .collect::<Vec<_>>()
     };
     assert_eq!(names(0, 3, None), ["s0", "s1", "s2"]);
     assert_eq!(names(3, 100, None), ["s3", "s4", "s5", "s6"]);
@@ -112,20 +134,34 @@ fn stale_shapes_come_in_order_of_arrival() -> Result<()> {
     let id = collection_id(&store, "chairs");
     store.catalog().write(|tx| -> Result<()> {
         tx.set_epoch(id, 1)?;
-        tx.put_labels(shapes[1], &label_version(&description(21, 1), 2, 6), &summary(1, &[2]))?;
+        tx.put_labels(
+            shapes[1],
+            &label_version(&description(21, 1), 2, 6),
+            &summary(1, &[2]),
+        )?;
         assert_eq!(tx.mark_stale_before(id, 1)?, 3);
         assert_eq!(tx.mark_stale_before(id, 1)?, 0);
         tx.set_stale(shapes[0], false)?;
         Ok(())
     })?;
-    let next = |id| store.catalog().read(|r| r.next_stale(id)).expect("readable");
+    let next = |id| {
+        store
+            .catalog()
+            .read(|r| r.next_stale(id))
+            .expect("readable")
+    };
     assert_eq!(next(Some(id)).expect("stale").id, shapes[2]);
     assert_eq!(next(None).expect("stale").id, shapes[2]);
     assert_eq!(store.catalog().read(|r| r.n_stale(id))?, 2);
     let newest = label_version(&description(22, 2), 2, 7);
-    store.catalog().write(|tx| tx.put_labels(shapes[2], &newest, &summary(1, &[0])))?;
+    store
+        .catalog()
+        .write(|tx| tx.put_labels(shapes[2], &newest, &summary(1, &[0])))?;
     assert_eq!(next(Some(id)).expect("stale").id, shapes[3]);
-    let row = store.catalog().read(|r| r.shape(shapes[2]))?.expect("there");
+    let row = store
+        .catalog()
+        .read(|r| r.shape(shapes[2]))?
+        .expect("there");
     assert_eq!((row.version, row.label_epoch, row.stale), (2, 1, false));
     Ok(())
 }
@@ -137,7 +173,9 @@ fn the_newest_versions_of_labels_are_kept() -> Result<()> {
     let last = KEPT_LABEL_VERSIONS + 9;
     for version in 2..=last {
         let labels = label_version(&description(20, 0), version, version);
-        store.catalog().write(|tx| tx.put_labels(shape, &labels, &summary(0, &[0])))?;
+        store
+            .catalog()
+            .write(|tx| tx.put_labels(shape, &labels, &summary(0, &[0])))?;
     }
     let kept = store.catalog().read(|r| r.kept_versions(shape))?;
     assert_eq!(kept, (10..=last).collect::<Vec<_>>());
@@ -152,7 +190,9 @@ fn labels_that_do_not_fit_the_shape_are_refused() -> Result<()> {
     let refused = |change: &dyn Fn(&mut coseg::store::rows::LabelVersionRow)| {
         let mut labels = good.clone();
         change(&mut labels);
-        let put = store.catalog().write(|tx| tx.put_labels(shape, &labels, &summary(0, &[])));
+        let put = store
+            .catalog()
+            .write(|tx| tx.put_labels(shape, &labels, &summary(0, &[])));
         assert!(matches!(put, Err(StoreError::Must { .. })), "{put:?}");
     };
     refused(&|labels| labels.version = 1);
@@ -160,7 +200,9 @@ fn labels_that_do_not_fit_the_shape_are_refused() -> Result<()> {
     refused(&|labels| labels.polygon_labels.truncate(5));
     refused(&|labels| labels.polygon_confidence.push(1));
     refused(&|labels| labels.proxy_labels.push(1));
-    store.catalog().write(|tx| tx.put_labels(shape, &good, &summary(0, &[])))
+    store
+        .catalog()
+        .write(|tx| tx.put_labels(shape, &good, &summary(0, &[])))
 }
 
 #[test]
@@ -175,11 +217,23 @@ fn deleting_takes_what_belongs_to_it_and_nothing_else() -> Result<()> {
         assert_eq!(r.shape(shapes[1])?, None);
         assert_eq!(r.newest_labels(shapes[1])?, None);
         assert_eq!(r.stats(shapes[1])?, None);
-        assert_eq!((r.map(shapes[0], shapes[1])?, r.map(shapes[1], shapes[2])?), (None, None));
+        assert_eq!(
+            (r.map(shapes[0], shapes[1])?, r.map(shapes[1], shapes[2])?),
+            (None, None)
+        );
         Ok(())
     })?;
     let gone = store.catalog().write(|tx| tx.delete_shape(shapes[1]));
-    assert!(matches!(gone, Err(StoreError::Missing { table: "shapes", .. })), "{gone:?}");
+    assert!(
+        matches!(
+            gone,
+            Err(StoreError::Missing {
+                table: "shapes",
+                ..
+            })
+        ),
+        "{gone:?}"
+    );
     let id = collection_id(&store, "chairs");
     store.catalog().write(|tx| tx.delete_collection(id))?;
     store.catalog().read(|r| -> Result<()> {
@@ -213,10 +267,18 @@ fn the_log_of_a_name_outlives_its_collection() -> Result<()> {
     assert_ne!(first, second);
     let row = store.catalog().read(|r| r.collection("a"))?.expect("there");
     assert_eq!((row.sequence, row.next_ordinal, row.next_label), (3, 3, 4));
-    assert_eq!(store.catalog().read(|r| r.events_since("a", 0, 2))?.len(), 2);
+    assert_eq!(
+        store.catalog().read(|r| r.events_since("a", 0, 2))?.len(),
+        2
+    );
     assert_eq!(store.catalog().read(|r| r.sequence("never"))?, 0);
-    let unknown = store.catalog().write(|tx| tx.append_event(first, "x", "{}"));
-    assert!(matches!(unknown, Err(StoreError::Missing { .. })), "{unknown:?}");
+    let unknown = store
+        .catalog()
+        .write(|tx| tx.append_event(first, "x", "{}"));
+    assert!(
+        matches!(unknown, Err(StoreError::Missing { .. })),
+        "{unknown:?}"
+    );
     Ok(())
 }
 
@@ -224,16 +286,36 @@ fn the_log_of_a_name_outlives_its_collection() -> Result<()> {
 fn a_failed_change_leaves_no_trace() -> Result<()> {
     let (_dir, store) = opened();
     add_shape(&store, "chairs", "one", 1)?;
-    let before = store.catalog().read(|r| Ok::<_, StoreError>((r.totals()?, r.sequence("chairs")?)))?;
+    let before = store
+        .catalog()
+        .read(|r| Ok::<_, StoreError>((r.totals()?, r.sequence("chairs")?)))?;
     let id = collection_id(&store, "chairs");
     let taken = add_shape(&store, "chairs", "one", 2);
-    assert!(matches!(taken, Err(StoreError::Exists { table: "shapes", .. })), "{taken:?}");
+    assert!(
+        matches!(
+            taken,
+            Err(StoreError::Exists {
+                table: "shapes",
+                ..
+            })
+        ),
+        "{taken:?}"
+    );
     let failed: std::result::Result<(), StoreError> = store.catalog().write(|tx| {
         tx.append_event(id, "x", "{}")?;
         tx.take_ordinal(id)?;
         tx.insert_collection(&new_collection("chairs")).map(drop)
     });
-    assert!(matches!(failed, Err(StoreError::Exists { table: "collections", .. })), "{failed:?}");
+    assert!(
+        matches!(
+            failed,
+            Err(StoreError::Exists {
+                table: "collections",
+                ..
+            })
+        ),
+        "{failed:?}"
+    );
     let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
         store.catalog().write(|tx| -> Result<()> {
             tx.append_event(id, "x", "{}")?;
@@ -241,7 +323,9 @@ fn a_failed_change_leaves_no_trace() -> Result<()> {
         })
     }));
     assert!(panicked.is_err());
-    let after = store.catalog().read(|r| Ok::<_, StoreError>((r.totals()?, r.sequence("chairs")?)))?;
+    let after = store
+        .catalog()
+        .read(|r| Ok::<_, StoreError>((r.totals()?, r.sequence("chairs")?)))?;
     assert_eq!(before, after);
     add_shape(&store, "chairs", "two", 2).map(drop)
 }
@@ -257,8 +341,19 @@ fn rows_need_what_they_refer_to() -> Result<()> {
         format: "off".into(),
         replace: false,
     };
-    let job = store.catalog().write(|tx| tx.insert_job("chairs", 0, &[item(absent)]));
-    assert!(matches!(job, Err(StoreError::Missing { table: "objects", .. })), "{job:?}");
+    let job = store
+        .catalog()
+        .write(|tx| tx.insert_job("chairs", 0, &[item(absent)]));
+    assert!(
+        matches!(
+            job,
+            Err(StoreError::Missing {
+                table: "objects",
+                ..
+            })
+        ),
+        "{job:?}"
+    );
     let map = MapRow {
         from: shape,
         to: coseg::store::rows::ShapeId(77),
@@ -269,8 +364,17 @@ fn rows_need_what_they_refer_to() -> Result<()> {
         quality_json: "{}".into(),
     };
     let put = store.catalog().write(|tx| tx.put_map(&map));
-    assert!(matches!(put, Err(StoreError::Dangling { table: "maps", .. })), "{put:?}");
-    let put = store.catalog().write(|tx| tx.put_map(&MapRow { k2: 2, to: shape, ..map }));
+    assert!(
+        matches!(put, Err(StoreError::Dangling { table: "maps", .. })),
+        "{put:?}"
+    );
+    let put = store.catalog().write(|tx| {
+        tx.put_map(&MapRow {
+            k2: 2,
+            to: shape,
+            ..map
+        })
+    });
     assert!(matches!(put, Err(StoreError::Must { .. })), "{put:?}");
     Ok(())
 }
@@ -280,181 +384,40 @@ fn labels_have_names_colours_and_successors() -> Result<()> {
     let (_dir, store) = opened();
     add_shape(&store, "chairs", "one", 1)?;
     let id = collection_id(&store, "chairs");
-    let named = LabelRow { id: 1, name: Some("leg".into()), colour: [255, 0, 7], merged_into: None };
-    let merged = LabelRow { id: 2, name: None, colour: [0, 0, 0], merged_into: Some(1) };
+    let named = LabelRow {
+        id: 1,
+        name: Some("leg".into()),
+        colour: [255, 0, 7],
+        merged_into: None,
+    };
+    let merged = LabelRow {
+        id: 2,
+        name: None,
+        colour: [0, 0, 0],
+        merged_into: Some(1),
+    };
     store.catalog().write(|tx| -> Result<()> {
         tx.put_label(id, &named)?;
         tx.put_label(id, &merged)
     })?;
-    assert_eq!(store.catalog().read(|r| r.labels(id))?[1..], [named, merged]);
-    Ok(())
-}
-
-#[test]
-fn jobs_are_taken_up_again_in_order() -> Result<()> {
-    let (_dir, store) = opened();
-    let original = store.objects().put_original(b"bytes")?;
-    let item = |name: &str| NewJobItem {
-        name: name.into(),
-        original_digest: original.digest,
-        format: "obj".into(),
-        replace: name == "b",
-    };
-    let (first, second) = store.catalog().write(|tx| -> Result<_> {
-        tx.insert_object(&original)?;
-        let first = tx.insert_job("x", 10, &[item("a"), item("b")])?;
-        Ok((first, tx.insert_job("y", 11, &[item("c")])?))
-    })?;
-    store.catalog().write(|tx| tx.set_item(first, 0, ItemStatus::Failed, Some("{}")))?;
-    let queued = store.catalog().read(|r| r.queued_items())?;
-    let order: Vec<_> =
-        queued.iter().map(|i| (i.job, i.index, i.collection.as_str(), i.item.replace)).collect();
-    assert_eq!(order, [(first, 1, "x", true), (second, 0, "y", false)]);
-    let items = store.catalog().read(|r| r.job_items(first))?;
-    assert_eq!(items[0].status, ItemStatus::Failed);
-    assert_eq!(items[0].detail_json.as_deref(), Some("{}"));
-    assert_eq!(store.catalog().read(|r| r.job(second))?.expect("there").created_unix_secs, 11);
-    let unknown = store.catalog().write(|tx| tx.set_item(second, 5, ItemStatus::Done, None));
-    assert!(matches!(unknown, Err(StoreError::Missing { .. })), "{unknown:?}");
-    store.catalog().write(|tx| tx.set_item(second, 0, ItemStatus::Cancelled, None))?;
-    assert_eq!(store.catalog().write(|tx| tx.purge_jobs(100))?, 1, "the first has one queued");
-    assert_eq!(store.catalog().read(|r| r.job_items(second))?, []);
-    Ok(())
-}
-
-#[test]
-fn answers_are_kept_for_a_day_whatever_the_clock_does() -> Result<()> {
-    const DAY: u64 = 24 * 60 * 60;
-    let (_dir, store) = opened();
-    let row = |id: u64, created| RequestRow {
-        client_id: "c".into(),
-        request_id: id.to_string(),
-        request_digest: Digest::of(&id.to_le_bytes()),
-        reply: vec![0, 159, id as u8],
-        created_unix_secs: created,
-    };
-    let catalog = store.catalog();
-    let mut now = 1_000 * DAY;
-    catalog.write(|tx| tx.purge_requests(now, DAY))?;
-    catalog.write(|tx| tx.put_request(&row(1, now)))?;
-    let again = catalog.write(|tx| tx.put_request(&row(1, now)));
-    assert!(matches!(again, Err(StoreError::Exists { table: "requests", .. })), "{again:?}");
-    assert_eq!(catalog.read(|r| r.request("c", "1"))?, Some(row(1, now)));
-    assert_eq!(catalog.read(|r| r.request("d", "1"))?, None);
-    // Ten years on in one step, then a day back: nothing is forgotten.
-    for jump in [now + 3_650 * DAY, now - DAY] {
-        assert_eq!(catalog.write(|tx| tx.purge_requests(jump, 0))?, 0);
-        now = jump;
-    }
-    for _ in 0..24 {
-        now += 3_600;
-        assert_eq!(catalog.write(|tx| tx.purge_requests(now, 0))?, 0);
-    }
-    now += 3_600;
-    assert_eq!(catalog.write(|tx| tx.purge_requests(now, 0))?, 1);
+    assert_eq!(
+        store.catalog().read(|r| r.labels(id))?[1..],
+        [named, merged]
+    );
     Ok(())
 }
 
 #[test]
 fn confidence_keeps_its_ends() {
-    for (probability, stored) in
-        [(0.0, 0), (1.0, 255), (0.5, 128), (-3.0, 0), (9.0, 255), (f32::NAN, 0)]
-    {
+    for (probability, stored) in [
+        (0.0, 0),
+        (1.0, 255),
+        (0.5, 128),
+        (-3.0, 0),
+        (9.0, 255),
+        (f32::NAN, 0),
+    ] {
         assert_eq!(confidence_to_u8(probability), stored);
     }
     assert!((0..=255).all(|stored| confidence_to_u8(confidence_from_u8(stored)) == stored));
-}
-
-/// A reader that began before a commit goes on seeing what was, and neither waits for the other.
-#[test]
-fn readers_neither_wait_nor_see_half() -> Result<()> {
-    let (_dir, store) = opened();
-    add_shape(&store, "chairs", "s0", 0)?;
-    let id = collection_id(&store, "chairs");
-    let (in_transaction, wait_for_transaction) = mpsc::channel();
-    let (read, wait_for_read) = mpsc::channel();
-    let writing = &store;
-    std::thread::scope(|scope| {
-        scope.spawn(move || {
-            writing.catalog().write(|tx| -> Result<()> {
-                tx.set_state(id, b"new")?;
-                in_transaction.send(()).expect("the reader waits");
-                // The reader must get its answer while this transaction is open.
-                wait_for_read.recv_timeout(Duration::from_secs(60)).expect("the reader answers");
-                Ok(())
-            })
-        });
-        wait_for_transaction.recv().expect("the writer began");
-        let state = store.catalog().read(|r| r.collection_by_id(id)).expect("readable");
-        assert_eq!(state.expect("there").state, b"state");
-        read.send(()).expect("the writer waits");
-    });
-    store.catalog().read(|r| -> Result<()> {
-        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
-        // A commit in the middle of this read is not seen by it.
-        store.catalog().write(|tx| tx.set_state(id, b"newer"))?;
-        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
-        Ok(())
-    })
-}
-
-#[test]
-fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
-    let (_dir, store) = opened();
-    add_shape(&store, "chairs", "s0", 0)?;
-    let id = collection_id(&store, "chairs");
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        let readers: Vec<_> = (0..6)
-            .map(|_| {
-                scope.spawn(|| {
-                    let mut n_reads = 0;
-                    while n_reads == 0 || !done.load(Ordering::Relaxed) {
-                        store
-                            .catalog()
-                            .read(|r| -> Result<()> {
-                                let collection = r.collection_by_id(id)?.expect("there");
-                                let n_events = r.events_since("chairs", 0, usize::MAX)?.len();
-                                assert_eq!(collection.sequence, n_events as u64);
-                                assert_eq!(collection.next_ordinal, r.n_shapes(id)? + 1);
-                                Ok(())
-                            })
-                            .expect("readable");
-                        n_reads += 1;
-                    }
-                })
-            })
-            .collect();
-        for seed in 1..40 {
-            add_shape(&store, "chairs", &format!("s{seed}"), seed).expect("added");
-        }
-        done.store(true, Ordering::Relaxed);
-        for reader in readers {
-            reader.join().expect("no reader failed");
-        }
-    });
-    Ok(())
-}
-
-#[test]
-fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
-    let (dir, store) = opened();
-    let library = store.dir().to_path_buf();
-    drop(store);
-    let catalog = library.join("catalog.db");
-    let change = |sql: &str| {
-        let connection = rusqlite::Connection::open(&catalog).expect("opens");
-        connection.execute_batch(sql).expect("runs");
-    };
-    change("PRAGMA user_version = 2");
-    let newer = Store::open(&library).err().expect("refused");
-    assert!(matches!(newer, StoreError::Version { found: 2, supported: 1, .. }), "{newer}");
-    change("PRAGMA user_version = 1; PRAGMA application_id = 7");
-    assert!(Store::open(&library).err().expect("refused").is_damage());
-    let other = dir.path().join("other");
-    std::fs::create_dir(&other).expect("created");
-    std::fs::write(other.join("catalog.db"), "not a database, but long enough to have a header ".repeat(9))
-        .expect("written");
-    assert!(Store::open(&other).err().expect("refused").is_damage());
-    Ok(())
 }

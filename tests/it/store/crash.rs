@@ -1,4 +1,4 @@
-//! Two processes, and processes that are killed.
+//! Two processes, processes that are killed, and system calls that fail.
 
 use super::{add_shape, collection_id};
 use coseg::store::check::check;
@@ -38,9 +38,15 @@ fn line_after(lines: &mut impl BufRead, prefix: &str) -> Option<String> {
 /// Not a test of its own: what the killed process does.
 #[test]
 fn child_adds_shapes_until_it_is_killed() {
-    let Some(library) = std::env::var_os(CHILD_LIBRARY) else { return };
+    let Some(library) = std::env::var_os(CHILD_LIBRARY) else {
+        return;
+    };
     let store = Store::open(Path::new(&library)).expect("opens");
-    let seen = store.catalog().read(|r| r.totals()).expect("readable").n_shapes as u32;
+    let seen = store
+        .catalog()
+        .read(|r| r.totals())
+        .expect("readable")
+        .n_shapes as u32;
     println!("ready {seen}");
     for seed in seen.. {
         add_shape(&store, "chairs", &format!("s{seed}"), seed).expect("added");
@@ -51,15 +57,20 @@ fn child_adds_shapes_until_it_is_killed() {
 #[test]
 fn one_process_holds_a_library() {
     let dir = tempfile::tempdir().expect("a folder");
-    let (mut process, mut lines) =
-        child("store::crash::child_adds_shapes_until_it_is_killed", dir.path());
+    let (mut process, mut lines) = child(
+        "store::crash::child_adds_shapes_until_it_is_killed",
+        dir.path(),
+    );
     line_after(&mut lines, "ready ").expect("the child opened the library");
     let second = Store::open(dir.path()).err().expect("refused");
     assert!(matches!(second, StoreError::Locked { .. }), "{second}");
     process.kill().expect("killed");
     process.wait().expect("ended");
     let store = Store::open(dir.path()).expect("a killed process holds nothing");
-    assert!(matches!(Store::open(dir.path()), Err(StoreError::Locked { .. })));
+    assert!(matches!(
+        Store::open(dir.path()),
+        Err(StoreError::Locked { .. })
+    ));
     drop(store);
     Store::open(dir.path()).expect("a closed store holds nothing");
 }
@@ -69,11 +80,19 @@ fn what_was_acknowledged_survives_a_kill() {
     let dir = tempfile::tempdir().expect("a folder");
     let mut n_acknowledged = 0;
     for round in 0..12 {
-        let (mut process, mut lines) =
-            child("store::crash::child_adds_shapes_until_it_is_killed", dir.path());
-        let seen = line_after(&mut lines, "ready ").expect("opens").parse::<u32>().expect("a count");
+        let (mut process, mut lines) = child(
+            "store::crash::child_adds_shapes_until_it_is_killed",
+            dir.path(),
+        );
+        let seen = line_after(&mut lines, "ready ")
+            .expect("opens")
+            .parse::<u32>()
+            .expect("a count");
         // One may have become durable and not been heard of.
-        assert!(seen == n_acknowledged || seen == n_acknowledged + 1, "{seen} {n_acknowledged}");
+        assert!(
+            seen == n_acknowledged || seen == n_acknowledged + 1,
+            "{seen} {n_acknowledged}"
+        );
         n_acknowledged = seen;
         for _ in 0..round % 5 {
             line_after(&mut lines, "acknowledged ").expect("goes on");
@@ -86,13 +105,19 @@ fn what_was_acknowledged_survives_a_kill() {
         while line_after(&mut lines, "acknowledged ").is_some() {
             n_acknowledged += 1;
         }
-        let damage: Vec<_> =
-            check(dir.path()).expect("runs").into_iter().filter(|f| f.damage).collect();
+        let damage: Vec<_> = check(dir.path())
+            .expect("runs")
+            .into_iter()
+            .filter(|f| f.damage)
+            .collect();
         assert_eq!(damage, [], "after kill {round}");
     }
     let store = Store::open(dir.path()).expect("opens");
     let id = collection_id(&store, "chairs");
-    let shapes = store.catalog().read(|r| r.shapes(id, 0, usize::MAX, None)).expect("readable");
+    let shapes = store
+        .catalog()
+        .read(|r| r.shapes(id, 0, usize::MAX, None))
+        .expect("readable");
     assert!(shapes.len() as u32 >= n_acknowledged);
     assert!(n_acknowledged > 0);
     for (seed, shape) in shapes.iter().enumerate() {
@@ -101,7 +126,194 @@ fn what_was_acknowledged_survives_a_kill() {
             .catalog()
             .read(|r| r.object(ObjectKind::Original, &shape.content_digest))
             .expect("readable");
-        let bytes = store.objects().original(&object.expect("catalogued")).expect("whole");
+        let bytes = store
+            .objects()
+            .original(&object.expect("catalogued"))
+            .expect("whole");
         assert_eq!(bytes, format!("OFF chairs s{seed} {seed}").into_bytes());
     }
+}
+
+/// Shapes the traced child adds.
+const N_TRACED: u32 = 3;
+
+/// Not a test of its own: adds a few shapes, tells what became of each, and ends.
+#[test]
+fn child_adds_a_few_shapes() {
+    let Some(library) = std::env::var_os(CHILD_LIBRARY) else {
+        return;
+    };
+    let store = match Store::open(Path::new(&library)) {
+        Ok(store) => store,
+        Err(error) => return println!("not opened {error}"),
+    };
+    let seen = store
+        .catalog()
+        .read(|r| r.totals())
+        .expect("readable")
+        .n_shapes as u32;
+    for seed in seen..seen + N_TRACED {
+        // The same name until it succeeds, as a client would.
+        match add_shape(&store, "chairs", &format!("s{seed}"), seed) {
+            Ok(_) => println!("acknowledged {seed}"),
+            Err(error) => {
+                let stopped = store.health().read_only().is_some();
+                assert_eq!(
+                    stopped,
+                    matches!(error, StoreError::ReadOnly { .. }),
+                    "{error}"
+                );
+                println!("refused {error}");
+                let again = add_shape(&store, "chairs", &format!("s{seed}"), seed);
+                assert!(
+                    !stopped || matches!(again, Err(StoreError::ReadOnly { .. })),
+                    "{again:?}"
+                );
+                store
+                    .catalog()
+                    .read(|r| r.totals())
+                    .expect("reads are served");
+                return println!("ended");
+            }
+        }
+    }
+    println!("ended");
+}
+
+/// What became of a child one of whose system calls was tampered with.
+struct Traced {
+    n_acknowledged: u32,
+    refused: bool,
+    ended: bool,
+    tampered: bool,
+}
+
+/// Runs the child with the `n`th call of `call` tampered with, if it makes as many.
+fn traced(library: &Path, call: &str, tamper: &str, n: u32) -> Traced {
+    let log = tempfile::NamedTempFile::new().expect("a file");
+    let output = Command::new("strace")
+        .args(["-f", "-qq", "-e", &format!("trace={call}"), "-o"])
+        .arg(log.path())
+        .args(["-e", &format!("inject={call}:{tamper}:when={n}")])
+        .arg(std::env::current_exe().expect("a path"))
+        .args([
+            "--exact",
+            "store::crash::child_adds_a_few_shapes",
+            "--nocapture",
+        ])
+        .args(["--test-threads=1"])
+        .env(CHILD_LIBRARY, library)
+        .output()
+        .expect("runs");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(!text.contains("panicked"), "{call} {n}: {text}");
+    Traced {
+        n_acknowledged: text.matches("acknowledged ").count() as u32,
+        refused: text.contains("refused ") || text.contains("not opened "),
+        ended: output.status.success(),
+        tampered: std::fs::read_to_string(log.path())
+            .expect("readable")
+            .contains("(INJECTED)"),
+    }
+}
+
+/// Whether system calls can be tampered with here.
+fn can_trace() -> bool {
+    let run = Command::new("strace")
+        .args(["-qq", "-o", "/dev/null", "true"])
+        .status();
+    let can = run.is_ok_and(|status| status.success());
+    if !can {
+        println!("skipped: strace cannot trace here");
+    }
+    can
+}
+
+/// What must hold of a library after the child, which acknowledged so many shapes in it.
+fn assert_whole(library: &Path, n_acknowledged: u32, context: &str) {
+    if library.join("catalog.db").exists() {
+        let findings = check(library).unwrap_or_default();
+        let damage: Vec<_> = findings.iter().filter(|finding| finding.damage).collect();
+        // Before the very first commit there is no catalog yet to speak of.
+        assert!(
+            damage.is_empty() || n_acknowledged == 0,
+            "{context}: {damage:?}"
+        );
+    }
+    let store = Store::open(library).expect("starts unaided");
+    let n_shapes = store
+        .catalog()
+        .read(|r| r.totals())
+        .expect("readable")
+        .n_shapes as u32;
+    assert!(
+        n_shapes == n_acknowledged || n_shapes == n_acknowledged + 1,
+        "{context}: {n_shapes} shapes, {n_acknowledged} acknowledged"
+    );
+    add_shape(&store, "chairs", &format!("s{n_shapes}"), n_shapes).expect("goes on");
+    drop(store);
+    assert_eq!(
+        check(library)
+            .expect("runs")
+            .iter()
+            .filter(|f| f.damage)
+            .count(),
+        0,
+        "{context}"
+    );
+}
+
+#[test]
+fn a_kill_at_any_durable_call_loses_nothing() {
+    if !can_trace() {
+        return;
+    }
+    let mut n_kills = 0;
+    // Every sync and rename; of the many writes every seventh.
+    for (call, step) in [
+        ("fsync", 1),
+        ("fdatasync", 1),
+        ("rename", 1),
+        ("pwrite64", 7),
+    ] {
+        for n in (1..).step_by(step) {
+            let dir = tempfile::tempdir().expect("a folder");
+            let child = traced(dir.path(), call, "signal=KILL", n);
+            assert_whole(dir.path(), child.n_acknowledged, &format!("{call} {n}"));
+            if child.ended {
+                assert_eq!(child.n_acknowledged, N_TRACED);
+                break;
+            }
+            n_kills += 1;
+        }
+    }
+    println!("killed {n_kills} times");
+    assert!(n_kills > 40, "{n_kills}");
+}
+
+#[test]
+fn a_failing_sync_is_answered_with_refusal() {
+    if !can_trace() {
+        return;
+    }
+    let mut n_refused = 0;
+    for call in ["fsync", "fdatasync"] {
+        for n in 1.. {
+            let dir = tempfile::tempdir().expect("a folder");
+            let child = traced(dir.path(), call, "error=EIO", n);
+            assert!(child.ended, "{call} {n}");
+            assert_whole(dir.path(), child.n_acknowledged, &format!("{call} {n}"));
+            if !child.tampered {
+                break;
+            }
+            // SQLite ignores failed syncs of the folder, which the store syncs again itself.
+            assert!(
+                child.refused || child.n_acknowledged == N_TRACED,
+                "{call} {n}"
+            );
+            n_refused += u32::from(child.refused);
+        }
+    }
+    println!("refused {n_refused} times");
+    assert!(n_refused > 20, "{n_refused}");
 }

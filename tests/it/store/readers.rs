@@ -1,0 +1,121 @@
+//! Readers beside a writer, and catalogs that are not ours to read.
+
+use super::{add_shape, collection_id, opened};
+use coseg::store::{Store, StoreError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::time::Duration;
+
+type Result<T> = std::result::Result<T, StoreError>;
+
+/// A reader that began before a commit goes on seeing what was, and neither waits for the other.
+#[test]
+fn readers_neither_wait_nor_see_half() -> Result<()> {
+    let (_dir, store) = opened();
+    add_shape(&store, "chairs", "s0", 0)?;
+    let id = collection_id(&store, "chairs");
+    let (in_transaction, wait_for_transaction) = mpsc::channel();
+    let (read, wait_for_read) = mpsc::channel();
+    let writing = &store;
+    std::thread::scope(|scope| {
+        scope.spawn(move || {
+            writing.catalog().write(|tx| -> Result<()> {
+                tx.set_state(id, b"new")?;
+                in_transaction.send(()).expect("the reader waits");
+                // The reader must get its answer while this transaction is open.
+                wait_for_read
+                    .recv_timeout(Duration::from_secs(60))
+                    .expect("the reader answers");
+                Ok(())
+            })
+        });
+        wait_for_transaction.recv().expect("the writer began");
+        let state = store
+            .catalog()
+            .read(|r| r.collection_by_id(id))
+            .expect("readable");
+        assert_eq!(state.expect("there").state, b"state");
+        read.send(()).expect("the writer waits");
+    });
+    store.catalog().read(|r| -> Result<()> {
+        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
+        // A commit in the middle of this read is not seen by it.
+        store.catalog().write(|tx| tx.set_state(id, b"newer"))?;
+        assert_eq!(r.collection_by_id(id)?.expect("there").state, b"new");
+        Ok(())
+    })
+}
+
+#[test]
+fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
+    let (_dir, store) = opened();
+    add_shape(&store, "chairs", "s0", 0)?;
+    let id = collection_id(&store, "chairs");
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let readers: Vec<_> = (0..6)
+            .map(|_| {
+                scope.spawn(|| {
+                    let mut n_reads = 0;
+                    while n_reads == 0 || !done.load(Ordering::Relaxed) {
+                        store
+                            .catalog()
+                            .read(|r| -> Result<()> {
+                                let collection = r.collection_by_id(id)?.expect("there");
+                                let n_events = r.events_since("chairs", 0, usize::MAX)?.len();
+                                assert_eq!(collection.sequence, n_events as u64);
+                                assert_eq!(collection.next_ordinal, r.n_shapes(id)? + 1);
+                                Ok(())
+                            })
+                            .expect("readable");
+                        n_reads += 1;
+                    }
+                })
+            })
+            .collect();
+        for seed in 1..40 {
+            add_shape(&store, "chairs", &format!("s{seed}"), seed).expect("added");
+        }
+        done.store(true, Ordering::Relaxed);
+        for reader in readers {
+            reader.join().expect("no reader failed");
+        }
+    });
+    Ok(())
+}
+
+#[test]
+fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
+    let (dir, store) = opened();
+    let library = store.dir().to_path_buf();
+    drop(store);
+    let catalog = library.join("catalog.db");
+    let change = |sql: &str| {
+        let connection = rusqlite::Connection::open(&catalog).expect("opens");
+        connection.execute_batch(sql).expect("runs");
+    };
+    change("PRAGMA user_version = 2");
+    let newer = Store::open(&library).err().expect("refused");
+    assert!(
+        matches!(
+            newer,
+            StoreError::Version {
+                found: 2,
+                supported: 1,
+                ..
+            }
+        ),
+        "{newer}"
+    );
+    change("PRAGMA user_version = 1; PRAGMA application_id = 7");
+    assert!(Store::open(&library).err().expect("refused").is_damage());
+    let other = dir.path().join("other");
+    std::fs::create_dir(&other).expect("created");
+    std::fs::write(
+        other.join("catalog.db"),
+        "not a database, but long enough to have a header ".repeat(9),
+    )
+    .expect("written");
+    assert!(Store::open(&other).err().expect("refused").is_damage());
+    Ok(())
+}
