@@ -186,7 +186,15 @@ fn the_same_seed_gives_the_same_bytes() {
     assert_eq!(digests, DIGESTS);
 }
 
-const DIGESTS: [&str; 7] = ["", "", "", "", "", "", ""];
+const DIGESTS: [&str; 7] = [
+    "ace8e64752965681",
+    "1aaa1d6a994246bc",
+    "594ff21f326188ef",
+    "ca06ff62109576ce",
+    "c6b97430c721f22e",
+    "9f25db38ed703c33",
+    "5651c35fcfbfc722",
+];
 
 #[test]
 fn members_do_not_depend_on_the_others_but_on_seed_and_index() {
