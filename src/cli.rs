@@ -42,7 +42,13 @@ pub(crate) struct Cli {
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Global {
     /// Where the daemon is: ipc://PATH or tcp://HOST:PORT [default: the daemon's own default socket]
-    #[arg(long, global = true, env = "COSEG_ENDPOINT", value_name = "URI", hide_env_values = true)]
+    #[arg(
+        long,
+        global = true,
+        env = "COSEG_ENDPOINT",
+        value_name = "URI",
+        hide_env_values = true
+    )]
     pub(crate) endpoint: Option<String>,
     /// Seconds to wait for an answer; work that goes on is waited for all the same
     #[arg(long, global = true, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
@@ -53,7 +59,9 @@ pub(crate) struct Global {
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
-    let seconds: f64 = text.parse().map_err(|_| format!("{text:?} is not a number of seconds"))?;
+    let seconds: f64 = text
+        .parse()
+        .map_err(|_| format!("{text:?} is not a number of seconds"))?;
     match Duration::try_from_secs_f64(seconds) {
         Ok(duration) if !duration.is_zero() && seconds <= 86_400.0 => Ok(duration),
         _ => Err(format!("{seconds} s is not between 0 and 86400")),
@@ -165,7 +173,10 @@ impl Settings {
             name: name.to_owned(),
             n_parts: self.parts,
             up: self.up.unwrap_or(wire::Up::Unspecified).into(),
-            operator: self.operator.map_or(wire::Operator::Unspecified, Operator::to_wire).into(),
+            operator: self
+                .operator
+                .map_or(wire::Operator::Unspecified, Operator::to_wire)
+                .into(),
             working_faces: self.working_faces.unwrap_or(0),
         }
     }
@@ -429,7 +440,15 @@ mod tests {
 
     #[test]
     fn global_flags_may_follow_the_subcommand() {
-        let line = ["coseg", "ls", "--endpoint", "ipc:///x", "--json", "--timeout", "0.5"];
+        let line = [
+            "coseg",
+            "ls",
+            "--endpoint",
+            "ipc:///x",
+            "--json",
+            "--timeout",
+            "0.5",
+        ];
         let cli = Cli::try_parse_from(line).unwrap();
         assert_eq!(cli.global.endpoint.as_deref(), Some("ipc:///x"));
         assert!(cli.global.json);

@@ -31,7 +31,11 @@ pub enum ConfigError {
     #[error("{origin}: {message}")]
     Unreadable { origin: String, message: String },
     #[error("{origin}: unknown key {key:?}; the nearest known one is {nearest:?}")]
-    UnknownKey { origin: String, key: String, nearest: String },
+    UnknownKey {
+        origin: String,
+        key: String,
+        nearest: String,
+    },
     #[error("{key}: {message}")]
     Value { key: String, message: String },
 }
@@ -148,7 +152,10 @@ impl std::str::FromStr for ByteSize {
 
 impl fmt::Display for ByteSize {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let unit = UNITS[..4].iter().rev().find(|(_, unit)| self.0 > 0 && self.0 % unit == 0);
+        let unit = UNITS[..4]
+            .iter()
+            .rev()
+            .find(|(_, unit)| self.0 > 0 && self.0 % unit == 0);
         match unit {
             Some((name, unit)) => write!(f, "{}{name}", self.0 / unit),
             None => write!(f, "{}", self.0),
@@ -165,7 +172,9 @@ impl Serialize for ByteSize {
 impl<'de> Deserialize<'de> for ByteSize {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         // A number arrives as its digits.
-        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
+        String::deserialize(deserializer)?
+            .parse()
+            .map_err(serde::de::Error::custom)
     }
 }
 
@@ -197,15 +206,20 @@ impl Default for Config {
 impl Config {
     /// All layers, checked.
     pub fn load(overrides: &Overrides) -> Result<Self, ConfigError> {
-        let known = keys_of(&config::File::from_str(DEFAULT, FileFormat::Toml), "defaults")?;
-        let mut builder = config::Config::builder()
-            .add_source(config::File::from_str(DEFAULT, FileFormat::Toml));
+        let known = keys_of(
+            &config::File::from_str(DEFAULT, FileFormat::Toml),
+            "defaults",
+        )?;
+        let mut builder =
+            config::Config::builder().add_source(config::File::from_str(DEFAULT, FileFormat::Toml));
         let named = overrides.file.clone();
         let file = named.or_else(|| Some(SYSTEM_FILE.into()).filter(|f: &PathBuf| f.exists()));
         if let Some(file) = file {
             let origin = file.display().to_string();
-            let text = std::fs::read_to_string(&file)
-                .map_err(|e| ConfigError::Unreadable { origin: origin.clone(), message: e.to_string() })?;
+            let text = std::fs::read_to_string(&file).map_err(|e| ConfigError::Unreadable {
+                origin: origin.clone(),
+                message: e.to_string(),
+            })?;
             let source = config::File::from_str(&text, FileFormat::Toml);
             check_keys(&keys_of(&source, &origin)?, &known, &origin)?;
             builder = builder.add_source(source);
@@ -216,7 +230,11 @@ impl Config {
             .list_separator(":")
             .with_list_parse_key("ingest.paths")
             .try_parsing(true);
-        check_keys(&keys_of(&environment, "environment")?, &known, "environment")?;
+        check_keys(
+            &keys_of(&environment, "environment")?,
+            &known,
+            "environment",
+        )?;
         builder = builder.add_source(environment);
         let merged = builder.build().and_then(config::Config::try_deserialize);
         let mut config: Self = merged.map_err(|e| ConfigError::Unreadable {
@@ -241,7 +259,10 @@ impl Config {
 
     fn check(&self) -> Result<(), ConfigError> {
         let refuse = |key: &str, message: String| {
-            Err(ConfigError::Value { key: key.to_owned(), message })
+            Err(ConfigError::Value {
+                key: key.to_owned(),
+                message,
+            })
         };
         let at_least = |key: &str, found: usize, limit: usize| {
             if found >= limit {
@@ -249,12 +270,19 @@ impl Config {
             }
             refuse(key, format!("{found} is below the least value, {limit}"))
         };
-        at_least("limits.max_shapes_per_request", self.limits.max_shapes_per_request, 1)?;
+        at_least(
+            "limits.max_shapes_per_request",
+            self.limits.max_shapes_per_request,
+            1,
+        )?;
         at_least("limits.max_queued_shapes", self.limits.max_queued_shapes, 1)?;
         at_least("limits.max_requests", self.limits.max_requests, 1)?;
         if self.limits.memory.0 < MIN_MEMORY {
             let (found, limit) = (self.limits.memory, ByteSize(MIN_MEMORY));
-            return refuse("limits.memory", format!("{found} is below the least value, {limit}"));
+            return refuse(
+                "limits.memory",
+                format!("{found} is below the least value, {limit}"),
+            );
         }
         let quarter = ByteSize(self.limits.memory.0 / 4);
         if self.limits.max_message > quarter {
@@ -264,16 +292,28 @@ impl Config {
         }
         if self.limits.max_message.0 < 1 << 16 {
             let found = self.limits.max_message;
-            return refuse("limits.max_message", format!("{found} is below the least value, 64KiB"));
+            return refuse(
+                "limits.max_message",
+                format!("{found} is below the least value, 64KiB"),
+            );
         }
         if self.work.shape_seconds == 0 {
-            return refuse("work.shape_seconds", "0 is below the least value, 1".to_owned());
+            return refuse(
+                "work.shape_seconds",
+                "0 is below the least value, 1".to_owned(),
+            );
         }
         if let Err(e) = tracing_subscriber::EnvFilter::try_new(&self.log.level) {
-            return refuse("log.level", format!("{:?} is no level or filter: {e}", self.log.level));
+            return refuse(
+                "log.level",
+                format!("{:?} is no level or filter: {e}", self.log.level),
+            );
         }
         if let Some(path) = self.ingest.paths.iter().find(|p| !p.is_absolute()) {
-            return refuse("ingest.paths", format!("{:?} is not absolute", path.display()));
+            return refuse(
+                "ingest.paths",
+                format!("{:?} is not absolute", path.display()),
+            );
         }
         if !self.server.endpoint.is_empty() {
             crate::ipc::endpoint::Endpoint::parse(&self.server.endpoint)
@@ -329,7 +369,10 @@ pub fn library_directory(named: Option<&PathBuf>) -> Result<PathBuf, ConfigError
         return Ok(path.clone());
     }
     let variable = |name: &str| {
-        std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from).filter(|p| p.is_absolute())
+        std::env::var_os(name)
+            .filter(|v| !v.is_empty())
+            .map(PathBuf::from)
+            .filter(|p| p.is_absolute())
     };
     if let Some(state) = variable("STATE_DIRECTORY") {
         return Ok(state.join("library"));
@@ -374,26 +417,42 @@ fn check_keys(
     known: &BTreeSet<String>,
     origin: &str,
 ) -> Result<(), ConfigError> {
-    let Some(key) = keys.difference(known).next() else { return Ok(()) };
-    let nearest = known.iter().min_by_key(|k| strsim::damerau_levenshtein(k, key));
+    let Some(key) = keys.difference(known).next() else {
+        return Ok(());
+    };
+    let nearest = known
+        .iter()
+        .min_by_key(|k| strsim::damerau_levenshtein(k, key));
     let nearest = nearest.expect("invariant: there are known keys").clone();
     let (key, nearest) = if origin == "environment" {
         (variable_name(key), variable_name(&nearest))
     } else {
         (key.clone(), nearest)
     };
-    Err(ConfigError::UnknownKey { origin: origin.to_owned(), key, nearest })
+    Err(ConfigError::UnknownKey {
+        origin: origin.to_owned(),
+        key,
+        nearest,
+    })
 }
 
 /// `work.workers` as `COSEG__WORK__WORKERS`.
 fn variable_name(key: &str) -> String {
-    format!("{ENV_PREFIX}{ENV_SEPARATOR}{}", key.to_uppercase().replace('.', ENV_SEPARATOR))
+    format!(
+        "{ENV_PREFIX}{ENV_SEPARATOR}{}",
+        key.to_uppercase().replace('.', ENV_SEPARATOR)
+    )
 }
 
 /// Whether `path` is below one of `roots`, as paths on disk: links are followed first.
 pub fn is_below(path: &Path, roots: &[PathBuf]) -> bool {
-    let Ok(path) = path.canonicalize() else { return false };
-    roots.iter().filter_map(|r| r.canonicalize().ok()).any(|root| path.starts_with(root))
+    let Ok(path) = path.canonicalize() else {
+        return false;
+    };
+    roots
+        .iter()
+        .filter_map(|r| r.canonicalize().ok())
+        .any(|root| path.starts_with(root))
 }
 
 #[cfg(test)]
@@ -404,7 +463,10 @@ mod tests {
     fn load(text: &str) -> Result<Config, ConfigError> {
         let mut file = tempfile::NamedTempFile::new().unwrap();
         file.write_all(text.as_bytes()).unwrap();
-        let overrides = Overrides { file: Some(file.path().to_owned()), ..Overrides::default() };
+        let overrides = Overrides {
+            file: Some(file.path().to_owned()),
+            ..Overrides::default()
+        };
         Config::load(&overrides)
     }
 
@@ -421,7 +483,11 @@ mod tests {
     #[test]
     fn unknown_keys_name_the_nearest_known_one() {
         let error = load("[work]\nworker = 3\n").unwrap_err().to_string();
-        assert!(error.ends_with("unknown key \"work.worker\"; the nearest known one is \"work.workers\""));
+        assert!(
+            error.ends_with(
+                "unknown key \"work.worker\"; the nearest known one is \"work.workers\""
+            )
+        );
         let error = load("memory = 3\n").unwrap_err().to_string();
         assert!(error.contains("unknown key \"memory\""), "{error}");
     }
@@ -429,14 +495,26 @@ mod tests {
     #[test]
     fn values_out_of_range_are_refused() {
         for (text, message) in [
-            ("[limits]\nmemory = \"1MiB\"", "limits.memory: 1MiB is below the least value, 256MiB"),
-            ("[limits]\nmemory = \"lots\"", "\"lots\" is not a size such as 512MiB or 2GiB"),
+            (
+                "[limits]\nmemory = \"1MiB\"",
+                "limits.memory: 1MiB is below the least value, 256MiB",
+            ),
+            (
+                "[limits]\nmemory = \"lots\"",
+                "\"lots\" is not a size such as 512MiB or 2GiB",
+            ),
             (
                 "[limits]\nmax_message = \"1GiB\"",
                 "limits.max_message: 1GiB is above a quarter of limits.memory, 512MiB",
             ),
-            ("[server]\nendpoint = \"tcp://0.0.0.0:1\"", "is not loopback"),
-            ("[server]\nendpoint = \"udp://127.0.0.1:1\"", "neither ipc://PATH nor tcp://HOST:PORT"),
+            (
+                "[server]\nendpoint = \"tcp://0.0.0.0:1\"",
+                "is not loopback",
+            ),
+            (
+                "[server]\nendpoint = \"udp://127.0.0.1:1\"",
+                "neither ipc://PATH nor tcp://HOST:PORT",
+            ),
             ("[log]\nlevel = \"coseg=loud\"", "log.level"),
             ("[log]\nformat = \"xml\"", "format"),
             ("[ingest]\npaths = [\"relative\"]", "is not absolute"),
@@ -450,7 +528,12 @@ mod tests {
 
     #[test]
     fn sizes_are_read_and_written() {
-        for (text, bytes) in [("64MiB", 64 << 20), ("1000", 1000), ("2 kB", 2000), ("7B", 7)] {
+        for (text, bytes) in [
+            ("64MiB", 64 << 20),
+            ("1000", 1000),
+            ("2 kB", 2000),
+            ("7B", 7),
+        ] {
             let size: ByteSize = text.parse().unwrap();
             assert_eq!(size.0, bytes);
             assert_eq!(size.to_string().parse::<ByteSize>().unwrap(), size);

@@ -30,8 +30,10 @@ pub(crate) enum TelemetryError {
 }
 
 fn filter(level: &str) -> Result<EnvFilter, TelemetryError> {
-    EnvFilter::try_new(level)
-        .map_err(|source| TelemetryError::Level { level: level.to_owned(), source })
+    EnvFilter::try_new(level).map_err(|source| TelemetryError::Level {
+        level: level.to_owned(),
+        source,
+    })
 }
 
 /// Sets up logging for the whole process.
@@ -44,9 +46,9 @@ pub(crate) fn start(log: &Log) -> Result<Telemetry, TelemetryError> {
             let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(colour);
             registry.with(lines.with_target(false)).try_init()
         }
-        LogFormat::Json => {
-            registry.with(fmt::layer().json().with_writer(std::io::stderr)).try_init()
-        }
+        LogFormat::Json => registry
+            .with(fmt::layer().json().with_writer(std::io::stderr))
+            .try_init(),
     };
     started.map_err(|e| TelemetryError::Setup(e.to_string()))?;
     Ok(Telemetry { filter: handle })
@@ -56,6 +58,8 @@ impl Telemetry {
     /// Takes over another level.
     pub(crate) fn set_level(&self, level: &str) -> Result<(), TelemetryError> {
         let filter = filter(level)?;
-        self.filter.reload(filter).map_err(|e| TelemetryError::Setup(e.to_string()))
+        self.filter
+            .reload(filter)
+            .map_err(|e| TelemetryError::Setup(e.to_string()))
     }
 }

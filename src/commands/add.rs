@@ -26,8 +26,8 @@ const JOBS_AHEAD: usize = 4;
 const DEFAULT_COLLECTION: &str = "default";
 /// What lies beside meshes and is passed over without a word.
 const BESIDE_MESHES: [&str; 16] = [
-    "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg", "npy",
-    "npz", "html",
+    "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg",
+    "npy", "npz", "html",
 ];
 
 /// A mesh file to send.
@@ -83,7 +83,10 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
         let n_bytes = bytes.len() as u64;
         if n_bytes > limits.max_shape_bytes {
             let limit = limits.max_shape_bytes;
-            report.refused(&file.name, &format!("the file has {n_bytes} bytes, the limit is {limit}"));
+            report.refused(
+                &file.name,
+                &format!("the file has {n_bytes} bytes, the limit is {limit}"),
+            );
             continue;
         }
         if batch.shapes.len() == max_shapes || batch.n_bytes + n_bytes > max_bytes {
@@ -165,11 +168,19 @@ fn finish_job(
     session: &mut Session,
     report: &mut Report,
 ) -> Result<(), CommandError> {
-    let Some((job_id, _)) = jobs.pop_front() else { return Ok(()) };
+    let Some((job_id, _)) = jobs.pop_front() else {
+        return Ok(());
+    };
     let (mut revision, mut n_reported) = (0, 0);
     loop {
-        let request = wire::WatchJobRequest { job_id, revision, wait_ms: session.wait_ms() };
-        let job = call!(session.client, WatchJob(request))?.job.unwrap_or_default();
+        let request = wire::WatchJobRequest {
+            job_id,
+            revision,
+            wait_ms: session.wait_ms(),
+        };
+        let job = call!(session.client, WatchJob(request))?
+            .job
+            .unwrap_or_default();
         revision = job.revision;
         for item in job.items.iter().skip(n_reported) {
             match item.state() {
@@ -178,7 +189,9 @@ fn finish_job(
                     n_reported += 1;
                 }
                 ItemState::Unspecified | ItemState::Queued | ItemState::Running => {
-                    report.bar.set_message(format!("{} {}", item.name, item.stage));
+                    report
+                        .bar
+                        .set_message(format!("{} {}", item.name, item.stage));
                     break;
                 }
             }
@@ -215,7 +228,8 @@ impl Report {
     fn refused(&mut self, name: &str, message: &str) {
         self.bar.suspend(|| eprintln!("coseg: {name}: {message}"));
         let error = json!({ "code": "INVALID_ARGUMENT", "reason": "NOT_SENT", "message": message });
-        self.shapes.push(json!({ "name": name, "outcome": "failed", "error": error }));
+        self.shapes
+            .push(json!({ "name": name, "outcome": "failed", "error": error }));
         self.count("failed");
         self.n_failed += 1;
         self.bar.inc(1);
@@ -226,15 +240,22 @@ impl Report {
         let outcome = value["outcome"].as_str().unwrap_or_default().to_owned();
         if item.state() != ItemState::Done {
             self.n_failed += 1;
-            let message = item.error.as_ref().map_or("cancelled", |e| e.message.as_str());
-            self.bar.suspend(|| eprintln!("coseg: {}: {message}", item.name));
+            let message = item
+                .error
+                .as_ref()
+                .map_or("cancelled", |e| e.message.as_str());
+            self.bar
+                .suspend(|| eprintln!("coseg: {}: {message}", item.name));
         } else if !self.json {
             let p = item.placed.clone().unwrap_or_default();
             let seconds = p.stages.iter().map(|s| s.ms).sum::<f64>() / 1e3;
             let line = if p.outcome() == wire::Outcome::Unchanged {
                 format!("{}: {outcome}", item.name)
             } else {
-                format!("{}: {outcome}, {} maps, {seconds:.2} s", item.name, p.n_maps)
+                format!(
+                    "{}: {outcome}, {} maps, {seconds:.2} s",
+                    item.name, p.n_maps
+                )
             };
             self.bar.suspend(|| super::session::print_line(&line))?;
         }
@@ -284,7 +305,10 @@ fn mesh_files(paths: &[PathBuf]) -> Result<Vec<MeshFile>, CommandError> {
                 return Err(CommandError::Usage(text));
             }
         } else if !path.exists() {
-            return Err(CommandError::Usage(format!("{} does not exist", path.display())));
+            return Err(CommandError::Usage(format!(
+                "{} does not exist",
+                path.display()
+            )));
         } else {
             let file = mesh_file(path)?.ok_or_else(|| {
                 let text = format!("{} is not a mesh file (.obj, .off)", path.display());
@@ -308,7 +332,10 @@ fn mesh_files(paths: &[PathBuf]) -> Result<Vec<MeshFile>, CommandError> {
 }
 
 fn folder(path: &Path, files: &mut Vec<MeshFile>) -> Result<(), CommandError> {
-    let at = |source| CommandError::File { path: path.display().to_string(), source };
+    let at = |source| CommandError::File {
+        path: path.display().to_string(),
+        source,
+    };
     let entries = std::fs::read_dir(path).map_err(at)?;
     let mut names: Vec<String> = Vec::new();
     for entry in entries {
@@ -340,10 +367,22 @@ fn is_beside_meshes(name: &str) -> bool {
 fn mesh_file(path: &Path) -> Result<Option<MeshFile>, CommandError> {
     let not_text =
         || CommandError::Usage(format!("the name of {} is not valid UTF-8", path.display()));
-    let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
-    let Some(format) = Format::from_name(&name) else { return Ok(None) };
-    let stem = path.file_stem().and_then(|s| s.to_str()).ok_or_else(not_text)?;
-    Ok(Some(MeshFile { path: path.to_owned(), name: stem.to_owned(), format }))
+    let name = path
+        .file_name()
+        .map(|n| n.to_string_lossy())
+        .unwrap_or_default();
+    let Some(format) = Format::from_name(&name) else {
+        return Ok(None);
+    };
+    let stem = path
+        .file_stem()
+        .and_then(|s| s.to_str())
+        .ok_or_else(not_text)?;
+    Ok(Some(MeshFile {
+        path: path.to_owned(),
+        name: stem.to_owned(),
+        format,
+    }))
 }
 
 #[cfg(test)]
@@ -353,7 +392,15 @@ mod tests {
     #[test]
     fn a_folder_is_read_in_natural_order_and_other_files_are_skipped() {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["10.off", "9.OBJ", "9.labels.txt", "1.off", "x.step", ".hidden.off", "readme"] {
+        for name in [
+            "10.off",
+            "9.OBJ",
+            "9.labels.txt",
+            "1.off",
+            "x.step",
+            ".hidden.off",
+            "readme",
+        ] {
             std::fs::write(folder.path().join(name), "").unwrap();
         }
         let files = mesh_files(&[folder.path().to_owned()]).unwrap();
@@ -369,9 +416,19 @@ mod tests {
             std::fs::write(path(name), "").unwrap();
         }
         let files = mesh_files(&[path("b.off"), path("a.obj")]).unwrap();
-        assert_eq!(files.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["b", "a"]);
-        for paths in [vec![path("a.off"), path("a.obj")], vec![path("c.txt")], vec![path("none.off")]] {
-            assert!(matches!(mesh_files(&paths), Err(CommandError::Usage(_))), "{paths:?}");
+        assert_eq!(
+            files.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(),
+            ["b", "a"]
+        );
+        for paths in [
+            vec![path("a.off"), path("a.obj")],
+            vec![path("c.txt")],
+            vec![path("none.off")],
+        ] {
+            assert!(
+                matches!(mesh_files(&paths), Err(CommandError::Usage(_))),
+                "{paths:?}"
+            );
         }
     }
 }

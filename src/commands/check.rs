@@ -15,9 +15,9 @@ pub(crate) fn run(args: &Check, global: &Global) -> Outcome {
     let findings = Library::check(&directory)?;
     let n_damaged = findings.iter().filter(|f| f.damage).count();
     if global.json {
-        let list = findings.iter().map(|f| {
-            json!({ "place": f.place, "message": f.message, "damage": f.damage })
-        });
+        let list = findings
+            .iter()
+            .map(|f| json!({ "place": f.place, "message": f.message, "damage": f.damage }));
         let value = json!({
             "library": directory.display().to_string(),
             "ok": n_damaged == 0,

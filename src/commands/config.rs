@@ -36,7 +36,9 @@ pub(crate) fn run(command: &ConfigCommand, global: &Global) -> Outcome {
             print_line(&json!({ "settings": settings, "in_use": in_use }).to_string())?;
         }
         ConfigCommand::Show(_) => {
-            print_line(&format!("# endpoint in use: {endpoint}\n# events: {events}\n# library in use: {library}"))?;
+            print_line(&format!(
+                "# endpoint in use: {endpoint}\n# events: {events}\n# library in use: {library}"
+            ))?;
             print_line(to_toml(&settings).trim_end())?;
         }
     }

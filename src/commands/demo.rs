@@ -32,7 +32,7 @@ const DRAIN_LIMIT: Duration = Duration::from_secs(30);
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArgs {
     /// Which family; `coseg synth --list` shows them
-    #[arg(default_value = "animal")]
+    #[arg(default_value = "pliers")]
     family: Family,
     /// How many shapes
     #[arg(long, value_name = "N", default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..=1000))]
@@ -90,21 +90,33 @@ struct Sent {
 
 pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
     let begin = Instant::now();
-    let options = Options { n_faces: args.faces, rotate: args.rotate };
+    let options = Options {
+        n_faces: args.faces,
+        rotate: args.rotate,
+    };
     let shapes = coseg::synth::family(args.family, args.seed, args.count, &options);
     let made_seconds = begin.elapsed().as_secs_f64();
 
     // Dropped after the daemon has ended, since that has files there.
     let scratch = Scratch::create()?;
     let running = start(&scratch.0)?;
-    let global = Global { endpoint: Some(running.endpoint().to_string()), ..global.clone() };
+    let global = Global {
+        endpoint: Some(running.endpoint().to_string()),
+        ..global.clone()
+    };
     let mut session = Session::open(&global)?;
     if !session.json {
         let (family, n, n_faces) = (args.family, shapes.len(), args.faces);
         let names = args.family.label_names().join(", ");
-        session.line(&format!("family {family}: {n} shapes of {n_faces} faces, made in {made_seconds:.1} s"))?;
+        session.line(&format!(
+            "family {family}: {n} shapes of {n_faces} faces, made in {made_seconds:.1} s"
+        ))?;
         session.line(&format!("parts it has: {names}"))?;
-        session.line(&format!("daemon: {}, an empty library in {}", running.endpoint(), scratch.0.display()))?;
+        session.line(&format!(
+            "daemon: {}, an empty library in {}",
+            running.endpoint(),
+            scratch.0.display()
+        ))?;
         session.line("")?;
     }
     let done = stream(args, shapes, &mut session).and_then(|sent| finish(args, sent, &mut session));
@@ -114,7 +126,10 @@ pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
 }
 
 fn at(path: &Path, source: std::io::Error) -> CommandError {
-    CommandError::File { path: path.display().to_string(), source }
+    CommandError::File {
+        path: path.display().to_string(),
+        source,
+    }
 }
 
 /// A daemon with default settings on an empty library.
@@ -122,7 +137,10 @@ fn start(directory: &Path) -> Result<Running, CommandError> {
     let mut config = Config::default();
     config.server.endpoint = format!("ipc://{}/coseg.sock", directory.display());
     config.server.library = directory.join("library");
-    telemetry::start(&Log { level: "warn".to_owned(), ..config.log.clone() })?;
+    telemetry::start(&Log {
+        level: "warn".to_owned(),
+        ..config.log.clone()
+    })?;
     Ok(daemon::start(config).map_err(ServeError::Start)?)
 }
 
@@ -143,7 +161,13 @@ fn stream(
             _ => None,
         };
         let truth = shape.labels.iter().map(|&l| l as i32).collect();
-        sent.push(Sent { shape, truth, predicted, seconds, item });
+        sent.push(Sent {
+            shape,
+            truth,
+            predicted,
+            seconds,
+            item,
+        });
         let so_far = scored(&sent)?;
         if let (Some(last), false) = (sent.last(), session.json) {
             session.line(&arrival(last, &so_far))?;
@@ -162,7 +186,11 @@ fn add(
     let n_parts = args.family.label_names().len() as u32;
     let settings = Settings {
         parts: Some(args.parts.unwrap_or(n_parts)),
-        up: Some(if args.rotate { wire::Up::Unknown } else { wire::Up::PlusY }),
+        up: Some(if args.rotate {
+            wire::Up::Unknown
+        } else {
+            wire::Up::PlusY
+        }),
         operator: None,
         working_faces: None,
     };
@@ -188,8 +216,14 @@ fn add(
     };
     let mut revision = 0;
     loop {
-        let request = wire::WatchJobRequest { job_id, revision, wait_ms: session.wait_ms() };
-        let job = call!(session.client, WatchJob(request))?.job.unwrap_or_default();
+        let request = wire::WatchJobRequest {
+            job_id,
+            revision,
+            wait_ms: session.wait_ms(),
+        };
+        let job = call!(session.client, WatchJob(request))?
+            .job
+            .unwrap_or_default();
         revision = job.revision;
         if job.finished {
             let item = job.items.into_iter().next();
@@ -225,7 +259,11 @@ fn scored(sent: &[Sent]) -> Result<Score, CommandError> {
 fn arrival(sent: &Sent, so_far: &Score) -> String {
     let (name, seconds) = (&sent.shape.name, sent.seconds);
     if sent.predicted.is_none() {
-        let message = sent.item.error.as_ref().map_or("cancelled", |e| e.message.as_str());
+        let message = sent
+            .item
+            .error
+            .as_ref()
+            .map_or("cancelled", |e| e.message.as_str());
         return format!("{name}  failed: {message}");
     }
     let accuracy = so_far.shapes.last().copied().unwrap_or(0.0);
@@ -233,7 +271,9 @@ fn arrival(sent: &Sent, so_far: &Score) -> String {
         .into_iter()
         .map(|(label, share)| format!("{} {:.0} %", word(label), 100.0 * share))
         .collect();
-    let stages = stages(sent).into_iter().map(|(stage, ms)| format!("{stage} {ms:.0}"));
+    let stages = stages(sent)
+        .into_iter()
+        .map(|(stage, ms)| format!("{stage} {ms:.0}"));
     let stages: Vec<String> = stages.collect();
     format!(
         "{name}  {seconds:.2} s  accuracy {accuracy:.3}  {}\n    ms: {}",
@@ -243,7 +283,11 @@ fn arrival(sent: &Sent, so_far: &Score) -> String {
 }
 
 fn word(label: i32) -> String {
-    if label < 0 { "unlabelled".to_owned() } else { format!("label {label}") }
+    if label < 0 {
+        "unlabelled".to_owned()
+    } else {
+        format!("label {label}")
+    }
 }
 
 /// Share of the area of each label, the largest first.
@@ -283,8 +327,10 @@ fn finish(args: &DemoArgs, mut sent: Vec<Sent>, session: &mut Session) -> Outcom
         }
     };
     std::fs::create_dir_all(&out).map_err(|e| at(&out, e))?;
-    let labelled: Vec<(&Labelled, &[i32])> =
-        sent.iter().filter_map(|s| Some((&s.shape, s.predicted.as_deref()?))).collect();
+    let labelled: Vec<(&Labelled, &[i32])> = sent
+        .iter()
+        .filter_map(|s| Some((&s.shape, s.predicted.as_deref()?)))
+        .collect();
     for (name, bytes) in demo_ply::files(&labelled, &infos) {
         let path = out.join(name);
         std::fs::write(&path, bytes).map_err(|e| at(&path, e))?;
@@ -306,7 +352,10 @@ fn mean_stages(sent: &[Sent]) -> Vec<(String, f64)> {
             None => means.push((stage, ms)),
         }
     }
-    means.into_iter().map(|(stage, sum)| (stage, sum / sent.len() as f64)).collect()
+    means
+        .into_iter()
+        .map(|(stage, sum)| (stage, sum / sent.len() as f64))
+        .collect()
 }
 
 fn summary(
@@ -317,15 +366,24 @@ fn summary(
     out: &Path,
 ) -> Result<(), CommandError> {
     let mut rows = vec![vec!["stage".to_owned(), "mean ms".to_owned()]];
-    rows.extend(mean_stages(sent).into_iter().map(|(stage, ms)| vec![stage, format!("{ms:.1}")]));
+    rows.extend(
+        mean_stages(sent)
+            .into_iter()
+            .map(|(stage, ms)| vec![stage, format!("{ms:.1}")]),
+    );
     print_line(&format!("\n{}\n", table(&rows)))?;
     let names = args.family.label_names();
     for (predicted, truth) in &last.assignment {
         let name = usize::try_from(*truth).ok().and_then(|t| names.get(t));
-        print_line(&format!("label {predicted} is the {}", name.copied().unwrap_or("?")))?;
+        print_line(&format!(
+            "label {predicted} is the {}",
+            name.copied().unwrap_or("?")
+        ))?;
     }
     let mean = sent.iter().map(|s| s.seconds).sum::<f64>() / sent.len() as f64;
-    print_line(&format!("\n{mean:.2} s a shape, from sending the file to durable labels"))?;
+    print_line(&format!(
+        "\n{mean:.2} s a shape, from sending the file to durable labels"
+    ))?;
     print_line(&format!(
         "accuracy {:.3} (each shape as labelled on arrival: {:.3}), {} labels for {} parts",
         last.accuracy, on_arrival.accuracy, last.n_predicted_labels, last.n_true_labels
@@ -337,16 +395,24 @@ fn summary(
 }
 
 fn report(args: &DemoArgs, sent: &[Sent], on_arrival: &Score, last: &Score, out: &Path) -> Value {
-    let shapes = sent.iter().zip(&on_arrival.shapes).zip(&last.shapes).map(|((s, first), now)| {
-        let mut value = json::job_item(&s.item);
-        value["seconds"] = s.seconds.into();
-        value["accuracy_on_arrival"] = (*first).into();
-        value["accuracy"] = (*now).into();
-        let parts = shares(s).into_iter().map(|(label, share)| json!({"label": label, "area_share": share}));
-        value["parts"] = parts.collect();
-        value
-    });
-    let stages = mean_stages(sent).into_iter().map(|(stage, ms)| (stage, ms.into()));
+    let shapes = sent
+        .iter()
+        .zip(&on_arrival.shapes)
+        .zip(&last.shapes)
+        .map(|((s, first), now)| {
+            let mut value = json::job_item(&s.item);
+            value["seconds"] = s.seconds.into();
+            value["accuracy_on_arrival"] = (*first).into();
+            value["accuracy"] = (*now).into();
+            let parts = shares(s)
+                .into_iter()
+                .map(|(label, share)| json!({"label": label, "area_share": share}));
+            value["parts"] = parts.collect();
+            value
+        });
+    let stages = mean_stages(sent)
+        .into_iter()
+        .map(|(stage, ms)| (stage, ms.into()));
     let names = args.family.label_names();
     let assignment = last.assignment.iter().map(|(predicted, truth)| {
         let name = usize::try_from(*truth).ok().and_then(|t| names.get(t));

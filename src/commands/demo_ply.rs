@@ -1,12 +1,11 @@
 //! Labelled shapes become coloured PLY files: one each, and one with all of them side by side.
 
+use super::export_mesh::colour;
 use coseg::ipc::wire::LabelInfo;
 use coseg::mesh::TriMesh;
 use coseg::mesh::write::ply;
 use coseg::synth::Labelled;
 
-/// Colour of faces without a label.
-const UNLABELLED: [u8; 3] = [128, 128, 128];
 /// Colours of known parts, told apart from each other by people of all kinds of sight (M. Okabe and
 /// K. Ito, "Color universal design", 2008).
 const KNOWN: [[u8; 3]; 8] = [
@@ -27,11 +26,18 @@ const SPACING: f64 = 1.15;
 pub(super) fn files(shapes: &[(&Labelled, &[i32])], infos: &[LabelInfo]) -> Vec<(String, Vec<u8>)> {
     let mut files = Vec::with_capacity(shapes.len() + 1);
     let mut all = Scene::default();
-    let size = shapes.iter().map(|(s, _)| extent(&s.mesh)).fold(0.0, f64::max) * SPACING;
+    let size = shapes
+        .iter()
+        .map(|(s, _)| extent(&s.mesh))
+        .fold(0.0, f64::max)
+        * SPACING;
     for (i, (shape, labels)) in shapes.iter().enumerate() {
         let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, infos)).collect();
         let mesh = &shape.mesh;
-        files.push((format!("{}.ply", shape.name), ply(&mesh.vertices, &mesh.faces, &colours, labels)));
+        files.push((
+            format!("{}.ply", shape.name),
+            ply(&mesh.vertices, &mesh.faces, &colours, labels),
+        ));
         let column = size * i as f64;
         all.put(mesh, [column, 0.0, 0.0], &colours, labels);
         let known = |l: &u32| KNOWN[*l as usize % KNOWN.len()];
@@ -39,31 +45,41 @@ pub(super) fn files(shapes: &[(&Labelled, &[i32])], infos: &[LabelInfo]) -> Vec<
         let truth: Vec<i32> = shape.labels.iter().map(|&l| l as i32).collect();
         all.put(mesh, [column, 0.0, -size], &colours, &truth);
     }
-    files.push(("all.ply".to_owned(), ply(&all.vertices, &all.faces, &all.colours, &all.labels)));
+    files.push((
+        "all.ply".to_owned(),
+        ply(&all.vertices, &all.faces, &all.colours, &all.labels),
+    ));
     files
 }
 
 /// The area of a triangle.
 pub(super) fn face_area(mesh: &TriMesh, face: &[u32; 3]) -> f64 {
     let [a, b, c] = face.map(|v| mesh.vertices[v as usize]);
-    let (u, v) = ([0, 1, 2].map(|k| b[k] - a[k]), [0, 1, 2].map(|k| c[k] - a[k]));
-    let normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+    let (u, v) = (
+        [0, 1, 2].map(|k| b[k] - a[k]),
+        [0, 1, 2].map(|k| c[k] - a[k]),
+    );
+    let normal = [
+        u[1] * v[2] - u[2] * v[1],
+        u[2] * v[0] - u[0] * v[2],
+        u[0] * v[1] - u[1] * v[0],
+    ];
     normal.iter().map(|x| x * x).sum::<f64>().sqrt() / 2.0
-}
-
-fn colour(label: i32, infos: &[LabelInfo]) -> [u8; 3] {
-    let found = u32::try_from(label).ok().and_then(|id| infos.iter().find(|l| l.id == id));
-    found.map_or(UNLABELLED, |l| {
-        let [_, r, g, b] = l.colour_rgb.to_be_bytes();
-        [r, g, b]
-    })
 }
 
 /// The longest side of the bounding box.
 fn extent(mesh: &TriMesh) -> f64 {
     let side = |k: usize| {
-        let low = mesh.vertices.iter().map(|v| v[k]).fold(f64::INFINITY, f64::min);
-        let high = mesh.vertices.iter().map(|v| v[k]).fold(f64::NEG_INFINITY, f64::max);
+        let low = mesh
+            .vertices
+            .iter()
+            .map(|v| v[k])
+            .fold(f64::INFINITY, f64::min);
+        let high = mesh
+            .vertices
+            .iter()
+            .map(|v| v[k])
+            .fold(f64::NEG_INFINITY, f64::max);
         high - low
     };
     side(0).max(side(1)).max(side(2))
@@ -83,7 +99,8 @@ impl Scene {
         let first = self.vertices.len() as u32;
         let moved = |v: &[f64; 3]| [0, 1, 2].map(|k| v[k] + at[k]);
         self.vertices.extend(mesh.vertices.iter().map(moved));
-        self.faces.extend(mesh.faces.iter().map(|f| f.map(|v| v + first)));
+        self.faces
+            .extend(mesh.faces.iter().map(|f| f.map(|v| v + first)));
         self.colours.extend(colours);
         self.labels.extend(labels);
     }
@@ -109,8 +126,12 @@ mod tests {
             name: name.to_owned(),
         };
         let (a, b) = (shape("a"), shape("b"));
-        let infos =
-            [LabelInfo { id: 5, name: String::new(), colour_rgb: 0x01_02_03, merged_into: None }];
+        let infos = [LabelInfo {
+            id: 5,
+            name: String::new(),
+            colour_rgb: 0x01_02_03,
+            merged_into: None,
+        }];
         let files = files(&[(&a, &[5]), (&b, &[-1])], &infos);
         let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
         assert_eq!(names, ["a.ply", "b.ply", "all.ply"]);

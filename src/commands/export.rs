@@ -1,6 +1,6 @@
 //! `coseg export`: labels, or coloured meshes, of a collection become files.
 
-use super::export_mesh::{materials, obj, ply, polygons};
+use super::export_mesh::{colour, material, materials, polygons};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
@@ -8,6 +8,7 @@ use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
+use coseg::mesh::write::{mtl, obj, ply};
 use coseg::mesh::{Format, ParsedMesh, parse};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -20,9 +21,13 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
     }
-    let colours = session.describe(&collection)?.labels;
+    let infos = session.describe(&collection)?.labels;
     let shapes = match args.shapes.as_slice() {
-        [] => session.shapes(&collection, None)?.into_iter().map(|s| s.name).collect(),
+        [] => session
+            .shapes(&collection, None)?
+            .into_iter()
+            .map(|s| s.name)
+            .collect(),
         some => some.to_vec(),
     };
     std::fs::create_dir_all(&args.out).map_err(|e| at(&args.out, e))?;
@@ -50,24 +55,27 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             }
             ExportFormat::Ply => {
                 let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let text = ply(&mesh.vertices, &polygons(&mesh), &labels, &colours);
-                write(format!("{shape}.ply"), text.as_bytes())?;
+                let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, &infos)).collect();
+                let bytes = ply(&mesh.vertices, &polygons(&mesh), &colours, &labels);
+                write(format!("{shape}.ply"), &bytes)?;
             }
             ExportFormat::Obj => {
                 let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let text = obj(&mesh.vertices, &polygons(&mesh), &labels, &colours, MATERIALS);
+                let name = |label| material(label, &infos);
+                let text = obj(&mesh.vertices, &polygons(&mesh), &labels, name, MATERIALS);
                 write(format!("{shape}.obj"), text.as_bytes())?;
             }
         }
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        write(MATERIALS.to_owned(), materials(&colours).as_bytes())?;
+        write(MATERIALS.to_owned(), mtl(&materials(&infos)).as_bytes())?;
     }
     progress.finish_and_clear();
     if session.json {
         let format = format!("{:?}", args.format).to_lowercase();
-        session.print_json(&json!({ "collection": collection, "format": format, "files": written }))?;
+        session
+            .print_json(&json!({ "collection": collection, "format": format, "files": written }))?;
     } else {
         eprintln!("{} shapes written to {}", shapes.len(), args.out.display());
     }
@@ -75,7 +83,10 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
 }
 
 fn at(path: &Path, source: std::io::Error) -> CommandError {
-    CommandError::File { path: PathBuf::from(path).display().to_string(), source }
+    CommandError::File {
+        path: PathBuf::from(path).display().to_string(),
+        source,
+    }
 }
 
 /// The mesh of a shape as it was sent.
@@ -85,8 +96,10 @@ fn original(
     shape: &str,
     n_labels: usize,
 ) -> Result<ParsedMesh, CommandError> {
-    let request =
-        wire::GetOriginalRequest { collection: collection.to_owned(), shape: shape.to_owned() };
+    let request = wire::GetOriginalRequest {
+        collection: collection.to_owned(),
+        shape: shape.to_owned(),
+    };
     let (reply, frames) = call!(session.client, GetOriginal(request), frames)?;
     let bad = |message: String| CommandError::Client(ClientError::BadReply(message));
     let format = match reply.format() {

@@ -5,7 +5,9 @@ use serde_json::{Map, Value, json};
 
 /// The name of an enum value without its prefix, in lower case.
 fn short(name: &str, prefix: &str) -> String {
-    name.strip_prefix(prefix).unwrap_or(name).to_ascii_lowercase()
+    name.strip_prefix(prefix)
+        .unwrap_or(name)
+        .to_ascii_lowercase()
 }
 
 pub(crate) fn up(up: wire::Up) -> &'static str {
@@ -55,12 +57,13 @@ pub(crate) fn label(l: &wire::LabelInfo) -> Value {
 }
 
 pub(crate) fn shape(s: &wire::Shape) -> Value {
-    let parts = s.parts.iter().map(|p| {
-        json!({ "label": p.label, "area_share": p.area_share, "confidence": p.confidence })
-    });
-    let sources = s.sources.iter().map(|s| {
-        json!({ "shape": s.shape, "version": s.version, "weight": s.weight })
-    });
+    let parts = s.parts.iter().map(
+        |p| json!({ "label": p.label, "area_share": p.area_share, "confidence": p.confidence }),
+    );
+    let sources = s
+        .sources
+        .iter()
+        .map(|s| json!({ "shape": s.shape, "version": s.version, "weight": s.weight }));
     json!({
         "name": s.name,
         "ordinal": s.ordinal,
@@ -96,7 +99,8 @@ fn report(r: &wire::CleanReport) -> Value {
 
 /// One shape of a job; times in milliseconds by stage.
 pub(crate) fn job_item(i: &wire::JobItem) -> Value {
-    let mut value = json!({ "name": i.name, "outcome": short(i.state().as_str_name(), "ITEM_STATE_") });
+    let mut value =
+        json!({ "name": i.name, "outcome": short(i.state().as_str_name(), "ITEM_STATE_") });
     if let Some(p) = &i.placed {
         value["outcome"] = outcome(p.outcome()).into();
         value["version"] = p.version.into();
@@ -147,10 +151,12 @@ pub(crate) fn event(e: &wire::Event) -> Value {
         Some(Kind::CollectionDeleted(_)) => ("collection_deleted", json!({})),
         Some(Kind::ShapeAdded(a)) => {
             let shares = a.area_shares.iter();
-            let shares =
-                shares.map(|s| json!({ "label": s.label, "area_share": s.area_share }));
+            let shares = shares.map(|s| json!({ "label": s.label, "area_share": s.area_share }));
             let shares: Vec<_> = shares.collect();
-            ("shape_added", json!({ "shape": a.shape, "version": a.version, "area_shares": shares }))
+            (
+                "shape_added",
+                json!({ "shape": a.shape, "version": a.version, "area_shares": shares }),
+            )
         }
         Some(Kind::ShapeRemoved(r)) => ("shape_removed", json!({ "shape": r.shape })),
         Some(Kind::LabelsChanged(c)) => {
@@ -164,13 +170,9 @@ pub(crate) fn event(e: &wire::Event) -> Value {
             ("labels_changed", body)
         }
         Some(Kind::LabelCreated(l)) => ("label_created", json!({ "label": l.label })),
-        Some(Kind::LabelMerged(m)) => {
-            ("label_merged", json!({ "from": m.from, "into": m.into }))
-        }
+        Some(Kind::LabelMerged(m)) => ("label_merged", json!({ "from": m.from, "into": m.into })),
         Some(Kind::LabelSplit(s)) => ("label_split", json!({ "from": s.from, "into": s.into })),
-        Some(Kind::LabelNamed(n)) => {
-            ("label_named", json!({ "label": n.label, "name": n.name }))
-        }
+        Some(Kind::LabelNamed(n)) => ("label_named", json!({ "label": n.label, "name": n.name })),
         Some(Kind::Reclustered(r)) => {
             let body = json!({
                 "score_before": r.score_before,
@@ -200,9 +202,15 @@ pub(crate) fn event_line(e: &wire::Event) -> String {
         Some(Kind::CollectionDeleted(_)) => "collection deleted".to_owned(),
         Some(Kind::ShapeAdded(a)) => {
             let shares = a.area_shares.iter();
-            let shares: Vec<_> =
-                shares.map(|s| format!("{}: {}", s.label, percent(s.area_share))).collect();
-            format!("{} added, version {}, labels {}", a.shape, a.version, shares.join(", "))
+            let shares: Vec<_> = shares
+                .map(|s| format!("{}: {}", s.label, percent(s.area_share)))
+                .collect();
+            format!(
+                "{} added, version {}, labels {}",
+                a.shape,
+                a.version,
+                shares.join(", ")
+            )
         }
         Some(Kind::ShapeRemoved(r)) => format!("{} removed", r.shape),
         Some(Kind::LabelsChanged(c)) => {
@@ -210,7 +218,13 @@ pub(crate) fn event_line(e: &wire::Event) -> String {
             let moves: Vec<_> = moves
                 .map(|m| format!("{} to {}: {}", m.from, m.to, percent(m.area_share)))
                 .collect();
-            format!("{} relabelled ({}), version {}, {}", c.shape, c.cause, c.version, moves.join(", "))
+            format!(
+                "{} relabelled ({}), version {}, {}",
+                c.shape,
+                c.cause,
+                c.version,
+                moves.join(", ")
+            )
         }
         Some(Kind::LabelCreated(l)) => format!("label {} created", l.label),
         Some(Kind::LabelMerged(m)) => format!("label {} merged into {}", m.from, m.into),
@@ -218,7 +232,10 @@ pub(crate) fn event_line(e: &wire::Event) -> String {
         Some(Kind::LabelNamed(n)) => format!("label {} named {:?}", n.label, n.name),
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
-            format!("reclustered, score {:.3} to {:.3}, {taken}", r.score_before, r.score_after)
+            format!(
+                "reclustered, score {:.3} to {:.3}, {taken}",
+                r.score_before, r.score_after
+            )
         }
         Some(Kind::Heartbeat(_)) => "heartbeat".to_owned(),
     };

@@ -24,13 +24,23 @@ pub(crate) fn receive(
     let (reply, frames) = call!(session.client, GetLabels(request), frames)?;
     let reader = FrameReader::new(&frames);
     let bad = |e: coseg::ipc::frames::FrameError| ClientError::BadReply(e.to_string());
-    let (labels, _) = reader.i32_array(reply.labels.as_ref(), "labels").map_err(bad)?;
+    let (labels, _) = reader
+        .i32_array(reply.labels.as_ref(), "labels")
+        .map_err(bad)?;
     let confidence = reply.confidence.as_ref();
     let confidence = confidence
-        .map(|c| reader.f32_array(Some(c), "confidence").map(|(values, _)| values))
+        .map(|c| {
+            reader
+                .f32_array(Some(c), "confidence")
+                .map(|(values, _)| values)
+        })
         .transpose()
         .map_err(bad)?;
-    Ok(Received { version: reply.version, labels, confidence })
+    Ok(Received {
+        version: reply.version,
+        labels,
+        confidence,
+    })
 }
 
 pub(crate) fn run(args: &Labels, mut session: Session) -> Outcome {
@@ -58,7 +68,12 @@ pub(crate) fn run(args: &Labels, mut session: Session) -> Outcome {
         return Ok(true);
     }
     let lines: Vec<String> = match &received.confidence {
-        Some(c) => received.labels.iter().zip(c).map(|(l, c)| format!("{l} {c:.3}")).collect(),
+        Some(c) => received
+            .labels
+            .iter()
+            .zip(c)
+            .map(|(l, c)| format!("{l} {c:.3}"))
+            .collect(),
         None => received.labels.iter().map(i32::to_string).collect(),
     };
     if !lines.is_empty() {

@@ -15,13 +15,24 @@ pub(crate) fn run(args: &Ls, mut session: Session) -> Outcome {
 }
 
 fn collections(session: &mut Session) -> Outcome {
-    let reply = call!(session.client, ListCollections(wire::ListCollectionsRequest {}))?;
+    let reply = call!(
+        session.client,
+        ListCollections(wire::ListCollectionsRequest {})
+    )?;
     if session.json {
         let list: Vec<Value> = reply.collections.iter().map(json::collection).collect();
         session.print_json(&json!({ "collections": list }))?;
         return Ok(true);
     }
-    let heading = ["collection", "shapes", "stale", "labels", "parts", "up", "sequence"];
+    let heading = [
+        "collection",
+        "shapes",
+        "stale",
+        "labels",
+        "parts",
+        "up",
+        "sequence",
+    ];
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
     for c in &reply.collections {
         let spec = c.spec.clone().unwrap_or_default();

@@ -25,9 +25,17 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
     };
     let parts = call!(session.client, GetPartCorrespondence(request))?;
     if let Some(path) = &args.out {
-        write_arrays(path, &[("c_12", &map.c_12), ("p2p_21", &map.p2p_21)], &frames)?;
+        write_arrays(
+            path,
+            &[("c_12", &map.c_12), ("p2p_21", &map.p2p_21)],
+            &frames,
+        )?;
     }
-    let shape = map.c_12.as_ref().map(|c| c.shape.clone()).unwrap_or_default();
+    let shape = map
+        .c_12
+        .as_ref()
+        .map(|c| c.shape.clone())
+        .unwrap_or_default();
     let quality = map.quality.unwrap_or_default();
     if session.json {
         let matches: Vec<_> = parts.matches.iter().map(json::part_match).collect();
@@ -51,8 +59,17 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         quality.coverage,
         quality.near_zero
     ))?;
-    let (from, to) = (format!("part of {}", args.from), format!("part of {}", args.to));
-    let mut rows = vec![vec![from, "label".to_owned(), to, "label".to_owned(), "overlap".to_owned()]];
+    let (from, to) = (
+        format!("part of {}", args.from),
+        format!("part of {}", args.to),
+    );
+    let mut rows = vec![vec![
+        from,
+        "label".to_owned(),
+        to,
+        "label".to_owned(),
+        "overlap".to_owned(),
+    ]];
     rows.extend(parts.matches.iter().map(|m| {
         vec![
             m.part_a.to_string(),
@@ -83,7 +100,10 @@ fn write_arrays(
             DataType::Float64 => Dtype::F64,
             DataType::Unspecified => return Err(bad(format!("{name} has no element type"))),
         };
-        let frame = frames.get(array.frame as usize).map(AsRef::as_ref).unwrap_or_default();
+        let frame = frames
+            .get(array.frame as usize)
+            .map(AsRef::as_ref)
+            .unwrap_or_default();
         let shape = array.shape.iter().map(|&n| n as usize).collect();
         let view = TensorView::new(dtype, shape, frame).map_err(|e| bad(e.to_string()))?;
         tensors.push((name.to_string(), view));

@@ -80,7 +80,9 @@ impl CommandError {
     pub(crate) fn exit_code(&self) -> ExitCode {
         let code = match self {
             Self::Client(ClientError::NoAnswer { .. }) => exit::NO_ANSWER,
-            Self::Client(ClientError::Endpoint(_)) | Self::Usage(_) | Self::Config(_) => exit::USAGE,
+            Self::Client(ClientError::Endpoint(_)) | Self::Usage(_) | Self::Config(_) => {
+                exit::USAGE
+            }
             Self::Serve(ServeError::Start(e)) if e.is_configuration() => exit::USAGE,
             Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe => 0,
             Self::Client(_)
@@ -131,7 +133,9 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Events(args) => events::run(args, session()?),
         Command::Name(args) => name::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
-        Command::Synth(args) => synth::run(args, cli.global.json).map(|()| true).map_err(Into::into),
+        Command::Synth(args) => synth::run(args, cli.global.json)
+            .map(|()| true)
+            .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
         Command::Stats => stats::run(session()?),
         Command::Stop => stop::run(session()?),

@@ -8,9 +8,14 @@ use coseg::ipc::wire;
 
 pub(crate) fn run(args: &Name, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
-    let request =
-        wire::NameLabelRequest { collection, label: args.label, name: args.name.clone() };
-    let label = call!(session.client, NameLabel(request))?.label.unwrap_or_default();
+    let request = wire::NameLabelRequest {
+        collection,
+        label: args.label,
+        name: args.name.clone(),
+    };
+    let label = call!(session.client, NameLabel(request))?
+        .label
+        .unwrap_or_default();
     if session.json {
         session.print_json(&json::label(&label))?;
     }

@@ -9,18 +9,27 @@ use serde_json::json;
 
 pub(crate) fn run(args: &Nearest, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
-    let request =
-        wire::NearestRequest { collection, shape: args.shape.clone(), limit: args.limit };
+    let request = wire::NearestRequest {
+        collection,
+        shape: args.shape.clone(),
+        limit: args.limit,
+    };
     let reply = call!(session.client, Nearest(request))?;
     if session.json {
         let list = reply.neighbors.iter();
-        let list: Vec<_> =
-            list.map(|n| json!({ "shape": n.shape, "distance": n.distance })).collect();
+        let list: Vec<_> = list
+            .map(|n| json!({ "shape": n.shape, "distance": n.distance }))
+            .collect();
         session.print_json(&json!({ "shape": args.shape, "nearest": list }))?;
         return Ok(true);
     }
     let mut rows = vec![["shape", "distance"].map(str::to_owned).to_vec()];
-    rows.extend(reply.neighbors.iter().map(|n| vec![n.shape.clone(), format!("{:.4}", n.distance)]));
+    rows.extend(
+        reply
+            .neighbors
+            .iter()
+            .map(|n| vec![n.shape.clone(), format!("{:.4}", n.distance)]),
+    );
     session.line(&table(&rows))?;
     Ok(true)
 }

@@ -12,8 +12,10 @@ pub(crate) fn run(args: &Rm, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
     let (mut removed, mut failed) = (Vec::new(), Vec::new());
     for shape in &args.shapes {
-        let request =
-            wire::RemoveShapeRequest { collection: collection.clone(), shape: shape.clone() };
+        let request = wire::RemoveShapeRequest {
+            collection: collection.clone(),
+            shape: shape.clone(),
+        };
         match call!(session.client, RemoveShape(request)) {
             Ok(_) => removed.push(shape.clone()),
             Err(ClientError::Refused(e)) => {

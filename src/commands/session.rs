@@ -28,7 +28,10 @@ impl Session {
             None => Endpoint::default_for_user().to_string(),
         };
         let client = Client::connect(&uri, global.timeout)?;
-        Ok(Self { client, json: global.json })
+        Ok(Self {
+            client,
+            json: global.json,
+        })
     }
 
     /// Milliseconds that the daemon may wait before it answers that nothing has changed.
@@ -45,7 +48,9 @@ impl Session {
         let mut names = self.collection_names()?;
         match (names.pop(), names.is_empty()) {
             (Some(only), true) => Ok(only),
-            (None, _) => Err(CommandError::Failed("there is no collection yet".to_owned())),
+            (None, _) => Err(CommandError::Failed(
+                "there is no collection yet".to_owned(),
+            )),
             (Some(last), false) => {
                 names.push(last);
                 Err(ambiguous(&names))
@@ -55,13 +60,23 @@ impl Session {
 
     /// Names of all collections.
     pub(crate) fn collection_names(&mut self) -> Result<Vec<String>, CommandError> {
-        let reply = call!(self.client, ListCollections(wire::ListCollectionsRequest {}))?;
-        Ok(reply.collections.into_iter().filter_map(|c| c.spec).map(|s| s.name).collect())
+        let reply = call!(
+            self.client,
+            ListCollections(wire::ListCollectionsRequest {})
+        )?;
+        Ok(reply
+            .collections
+            .into_iter()
+            .filter_map(|c| c.spec)
+            .map(|s| s.name)
+            .collect())
     }
 
     /// One collection.
     pub(crate) fn describe(&mut self, name: &str) -> Result<wire::Collection, CommandError> {
-        let request = wire::DescribeCollectionRequest { collection: name.to_owned() };
+        let request = wire::DescribeCollectionRequest {
+            collection: name.to_owned(),
+        };
         let reply = call!(self.client, DescribeCollection(request))?;
         Ok(reply.collection.unwrap_or_default())
     }
@@ -76,8 +91,12 @@ impl Session {
         let mut page_token = String::new();
         loop {
             let collection = collection.to_owned();
-            let request =
-                wire::ListShapesRequest { collection, page_size: 0, page_token, label };
+            let request = wire::ListShapesRequest {
+                collection,
+                page_size: 0,
+                page_token,
+                label,
+            };
             let reply = call!(self.client, ListShapes(request))?;
             shapes.extend(reply.shapes);
             page_token = reply.next_page_token;
@@ -122,22 +141,34 @@ impl Session {
 /// Prints a line of data to stdout.
 pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();
-    writeln!(out, "{text}").and_then(|()| out.flush()).map_err(CommandError::Output)
+    writeln!(out, "{text}")
+        .and_then(|()| out.flush())
+        .map_err(CommandError::Output)
 }
 
 /// Several collections could be meant.
 pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     let names = names.join(", ");
-    CommandError::Usage(format!("there are several collections, choose one with --collection: {names}"))
+    CommandError::Usage(format!(
+        "there are several collections, choose one with --collection: {names}"
+    ))
 }
 
 /// Columns padded to the widest entry; the first row is the heading.
 pub(crate) fn table(rows: &[Vec<String>]) -> String {
     let n = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width = |i: usize| rows.iter().filter_map(|r| r.get(i)).map(|c| c.chars().count()).max();
+    let width = |i: usize| {
+        rows.iter()
+            .filter_map(|r| r.get(i))
+            .map(|c| c.chars().count())
+            .max()
+    };
     let widths: Vec<usize> = (0..n).map(|i| width(i).unwrap_or(0)).collect();
     let lines = rows.iter().map(|row| {
-        let cells = row.iter().zip(&widths).map(|(cell, &width)| format!("{cell:width$}"));
+        let cells = row
+            .iter()
+            .zip(&widths)
+            .map(|(cell, &width)| format!("{cell:width$}"));
         cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
     });
     lines.collect::<Vec<_>>().join("\n")
@@ -167,6 +198,9 @@ mod tests {
     #[test]
     fn columns_line_up() {
         let row = |a: &str, b: &str| vec![a.to_owned(), b.to_owned()];
-        assert_eq!(table(&[row("name", "n"), row("a", "12")]), "name  n\na     12");
+        assert_eq!(
+            table(&[row("name", "n"), row("a", "12")]),
+            "name  n\na     12"
+        );
     }
 }

@@ -11,8 +11,13 @@ pub(crate) fn run(args: &Show, mut session: Session) -> Outcome {
     let described = session.describe(&collection)?;
     match &args.shape {
         Some(shape) => {
-            let request = wire::GetShapeRequest { collection, shape: shape.clone() };
-            let shape = call!(session.client, GetShape(request))?.shape.unwrap_or_default();
+            let request = wire::GetShapeRequest {
+                collection,
+                shape: shape.clone(),
+            };
+            let shape = call!(session.client, GetShape(request))?
+                .shape
+                .unwrap_or_default();
             show_shape(&shape, &described, &session)
         }
         None => show_collection(&described, &session),
@@ -42,7 +47,11 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
         json::up(spec.up()),
         c.sequence
     ))?;
-    let mut rows = vec![["label", "name", "colour", "state"].map(str::to_owned).to_vec()];
+    let mut rows = vec![
+        ["label", "name", "colour", "state"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
     for l in &c.labels {
         let state = l.merged_into.map(|id| format!("merged into {id}"));
         rows.push(vec![
@@ -81,13 +90,21 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
             .filter(|(_, n)| *n > 0)
             .map(|(what, n)| format!("{n} {what}"))
             .collect();
-        let found = if found.is_empty() { "clean".to_owned() } else { found.join(", ") };
+        let found = if found.is_empty() {
+            "clean".to_owned()
+        } else {
+            found.join(", ")
+        };
         session.line(&format!(
             "mesh: {} components, {found}; proxy of {} faces",
             r.n_components, r.n_proxy_faces
         ))?;
     }
-    let mut rows = vec![["part", "label", "area", "confidence"].map(str::to_owned).to_vec()];
+    let mut rows = vec![
+        ["part", "label", "area", "confidence"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
     for (i, p) in s.parts.iter().enumerate() {
         rows.push(vec![
             i.to_string(),
@@ -100,7 +117,14 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
     if !s.sources.is_empty() {
         let sources = s.sources.iter();
         let sources: Vec<_> = sources
-            .map(|s| format!("{} version {} ({:.0} %)", s.shape, s.version, s.weight * 100.0))
+            .map(|s| {
+                format!(
+                    "{} version {} ({:.0} %)",
+                    s.shape,
+                    s.version,
+                    s.weight * 100.0
+                )
+            })
             .collect();
         session.line(&format!("labels carried from {}", sources.join(", ")))?;
     }

@@ -12,7 +12,8 @@ pub(crate) fn run(args: &InCollection, mut session: Session) -> Outcome {
     session.wait_until_idle(&collection)?;
     if session.json {
         let seconds = begin.elapsed().as_secs_f64();
-        session.print_json(&json!({ "collection": collection, "idle": true, "seconds": seconds }))?;
+        session
+            .print_json(&json!({ "collection": collection, "idle": true, "seconds": seconds }))?;
     }
     Ok(true)
 }

@@ -68,17 +68,29 @@ pub(crate) fn run(args: &Watch, mut session: Session) -> Outcome {
     let socket = session.client.subscribe(args.collection.as_deref())?;
     let silence = session.client.timeout().max(LEAST_SILENCE);
     let socket_error = |source| {
-        CommandError::Client(ClientError::Socket { endpoint: "events".to_owned(), source })
+        CommandError::Client(ClientError::Socket {
+            endpoint: "events".to_owned(),
+            source,
+        })
     };
     let ms = i32::try_from(silence.as_millis()).unwrap_or(i32::MAX);
     socket.set_rcvtimeo(ms).map_err(socket_error)?;
     // After subscribing, so that nothing falls between.
-    let mut printer =
-        Printer { seen: BTreeMap::new(), only: args.collection.clone(), left: args.limit };
-    let reply = call!(session.client, ListCollections(wire::ListCollectionsRequest {}))?;
+    let mut printer = Printer {
+        seen: BTreeMap::new(),
+        only: args.collection.clone(),
+        left: args.limit,
+    };
+    let reply = call!(
+        session.client,
+        ListCollections(wire::ListCollectionsRequest {})
+    )?;
     for c in reply.collections {
         let name = c.spec.unwrap_or_default().name;
-        let begin = args.since.filter(|_| printer.is_wanted(&name)).unwrap_or(c.sequence);
+        let begin = args
+            .since
+            .filter(|_| printer.is_wanted(&name))
+            .unwrap_or(c.sequence);
         printer.seen.insert(name.clone(), begin);
         if printer.is_wanted(&name) {
             printer.catch_up(&name, c.sequence, &mut session)?;

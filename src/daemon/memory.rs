@@ -22,7 +22,10 @@ pub(crate) struct Reservation {
 
 impl Budget {
     pub(crate) fn new(limit: u64) -> Arc<Self> {
-        Arc::new(Self { state: Mutex::new(State { limit, used: 0 }), freed: Notify::new() })
+        Arc::new(Self {
+            state: Mutex::new(State { limit, used: 0 }),
+            freed: Notify::new(),
+        })
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -33,9 +36,15 @@ impl Budget {
     /// Reserves now or not at all.
     pub(crate) fn try_reserve(self: &Arc<Self>, bytes: u64) -> Option<Reservation> {
         let mut state = self.state();
-        let used = state.used.checked_add(bytes).filter(|&used| used <= state.limit)?;
+        let used = state
+            .used
+            .checked_add(bytes)
+            .filter(|&used| used <= state.limit)?;
         state.used = used;
-        Some(Reservation { budget: Arc::clone(self), bytes })
+        Some(Reservation {
+            budget: Arc::clone(self),
+            bytes,
+        })
     }
 
     /// Waits until there is room. More than the limit is handed out when nothing else is, so that a limit
@@ -96,7 +105,9 @@ mod tests {
 
     #[test]
     fn waiting_ends_when_bytes_come_back() {
-        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .build()
+            .unwrap();
         runtime.block_on(async {
             let budget = Budget::new(100);
             let held = budget.reserve(100).await;

@@ -52,7 +52,10 @@ pub enum StartError {
     #[error("library {path}: {source}")]
     Library { path: String, source: LibraryError },
     #[error("{endpoint}: {source}")]
-    Socket { endpoint: String, source: zmq::Error },
+    Socket {
+        endpoint: String,
+        source: zmq::Error,
+    },
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -62,7 +65,9 @@ impl StartError {
     pub fn is_configuration(&self) -> bool {
         match self {
             Self::Config(_) => true,
-            Self::Endpoint(e) => !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. }),
+            Self::Endpoint(e) => {
+                !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
+            }
             Self::Library { .. } | Self::Socket { .. } | Self::Threads(_) => false,
         }
     }
@@ -157,7 +162,10 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     // First the socket: a second daemon should hear of the first, not of its library's lock.
     let bound = sockets::bind(&endpoint, &config.limits)?;
     let directory = config.library()?;
-    let opened = |source| StartError::Library { path: directory.display().to_string(), source };
+    let opened = |source| StartError::Library {
+        path: directory.display().to_string(),
+        source,
+    };
     let library = Library::open(&directory).map_err(opened)?;
     let mut queued = Vec::new();
     for item in library.queued_items().map_err(opened)? {
@@ -199,8 +207,10 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let runtime_tick = Arc::new(AtomicU64::new(0));
     let guard = runtime.enter();
     // What a lane commits before the publisher runs is not lost: the log has it.
-    let published: BTreeMap<_, _> =
-        collections.iter().map(|c| (c.spec.name.clone(), c.sequence)).collect();
+    let published: BTreeMap<_, _> = collections
+        .iter()
+        .map(|c| (c.spec.name.clone(), c.sequence))
+        .collect();
     let publisher = tokio::spawn(publish::run(Arc::clone(&daemon), notices_out, published));
     for collection in collections.iter().filter(|c| c.n_stale > 0) {
         daemon.nudge(&collection.spec.name);
@@ -237,7 +247,11 @@ fn instance() -> String {
     static STARTS: AtomicU64 = AtomicU64::new(0);
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     let nanos = since.map_or(0, |d| d.as_nanos());
-    format!("{:x}-{nanos:x}-{:x}", std::process::id(), STARTS.fetch_add(1, Ordering::Relaxed))
+    format!(
+        "{:x}-{nanos:x}-{:x}",
+        std::process::id(),
+        STARTS.fetch_add(1, Ordering::Relaxed)
+    )
 }
 
 /// Removes files that nothing needs any more, now and then; never at start.
@@ -287,41 +301,63 @@ impl Running {
         config.limits.clone_from(&new.limits);
         config.limits.max_message = max_message;
         config.limits.max_requests = max_requests;
-        self.daemon.request_memory.set_limit(config.limits.request_bytes());
-        self.daemon.describe_memory.set_limit(config.limits.describe_bytes());
+        self.daemon
+            .request_memory
+            .set_limit(config.limits.request_bytes());
+        self.daemon
+            .describe_memory
+            .set_limit(config.limits.describe_bytes());
         let mut waiting = Vec::new();
         for (key, differs) in [
-            ("server.endpoint", new.server.endpoint != config.server.endpoint),
-            ("server.library", new.server.library != config.server.library),
+            (
+                "server.endpoint",
+                new.server.endpoint != config.server.endpoint,
+            ),
+            (
+                "server.library",
+                new.server.library != config.server.library,
+            ),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
-            ("limits.max_requests", new.limits.max_requests != max_requests),
+            (
+                "limits.max_requests",
+                new.limits.max_requests != max_requests,
+            ),
             ("log.format", new.log.format != old.log.format),
         ] {
             if differs {
                 waiting.push(key);
             }
         }
-        *self.daemon.config.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(config);
+        *self
+            .daemon
+            .config
+            .write()
+            .unwrap_or_else(PoisonError::into_inner) = Arc::new(config);
         waiting
     }
 
     /// Counts of the socket thread and of the runtime that stand still when either hangs.
     fn ticks(&self) -> (u64, u64) {
-        (self.socket_tick.load(Ordering::Relaxed), self.runtime_tick.load(Ordering::Relaxed))
+        (
+            self.socket_tick.load(Ordering::Relaxed),
+            self.runtime_tick.load(Ordering::Relaxed),
+        )
     }
 
     /// Refuses changes, finishes what is being placed, answers what was asked, and ends; at most for
     /// `limit`. What was accepted and not placed stays queued in the library.
     pub fn drain(mut self, limit: Duration) {
         let deadline = Instant::now() + limit;
-        let Some(runtime) = self.runtime.take() else { return };
+        let Some(runtime) = self.runtime.take() else {
+            return;
+        };
         self.daemon.drain.send_replace(true);
         // Wakes whoever waits for a change, to be told.
         self.daemon.work.progress().close();
         let daemon = Arc::clone(&self.daemon);
         let publisher = self.publisher.take();
-        let ended = runtime.block_on(tokio::time::timeout(limit, async move {
+        let last_work = async move {
             daemon.lanes_ended().await;
             let max = u32::try_from(daemon.max_pending).unwrap_or(u32::MAX);
             let answered = Arc::clone(&daemon.pending).acquire_many_owned(max);
@@ -332,7 +368,9 @@ impl Running {
             if let Some(publisher) = publisher {
                 let _ = publisher.await;
             }
-        }));
+        };
+        // Inside, for the timer needs the runtime.
+        let ended = runtime.block_on(async { tokio::time::timeout(limit, last_work).await });
         if ended.is_err() {
             tracing::warn!("the drain took longer than {} s", limit.as_secs());
         }
@@ -340,7 +378,11 @@ impl Running {
         if let Some(sockets) = self.sockets.take() {
             let _ = sockets.join();
         }
-        runtime.shutdown_timeout(deadline.saturating_duration_since(Instant::now()).min(LAST_ANSWERS));
+        runtime.shutdown_timeout(
+            deadline
+                .saturating_duration_since(Instant::now())
+                .min(LAST_ANSWERS),
+        );
     }
 }
 

@@ -59,7 +59,11 @@ impl<S> Progress<S> {
     }
 
     pub(crate) fn add_lane(&mut self, collection: &str, steps: mpsc::UnboundedSender<S>) {
-        let lane = Lane { waiting: VecDeque::new(), n_live: 0, steps };
+        let lane = Lane {
+            waiting: VecDeque::new(),
+            n_live: 0,
+            steps,
+        };
         self.lanes.insert(collection.to_owned(), lane);
     }
 
@@ -85,7 +89,10 @@ impl<S> Progress<S> {
     pub(crate) fn push(&mut self, waiting: Waiting) {
         let (job, collection) = (waiting.item.job, waiting.item.collection.clone());
         self.highest_job = self.highest_job.max(job);
-        let lane = self.lanes.get_mut(&collection).expect("invariant: lanes come before shapes");
+        let lane = self
+            .lanes
+            .get_mut(&collection)
+            .expect("invariant: lanes come before shapes");
         if lane.waiting.is_empty() {
             self.turns.push_back(collection);
         }
@@ -98,8 +105,12 @@ impl<S> Progress<S> {
     /// The next shape to describe: collections take turns.
     pub(crate) fn pop(&mut self) -> Option<(Waiting, mpsc::UnboundedSender<S>)> {
         while let Some(collection) = self.turns.pop_front() {
-            let Some(lane) = self.lanes.get_mut(&collection) else { continue };
-            let Some(waiting) = lane.waiting.pop_front() else { continue };
+            let Some(lane) = self.lanes.get_mut(&collection) else {
+                continue;
+            };
+            let Some(waiting) = lane.waiting.pop_front() else {
+                continue;
+            };
             let steps = lane.steps.clone();
             if !lane.waiting.is_empty() {
                 self.turns.push_back(collection);
@@ -217,8 +228,9 @@ mod tests {
             progress.push(waiting("a", 1, index));
         }
         progress.push(waiting("b", 2, 0));
-        let order: Vec<_> =
-            std::iter::from_fn(|| progress.pop()).map(|(w, _)| w.item.name).collect();
+        let order: Vec<_> = std::iter::from_fn(|| progress.pop())
+            .map(|(w, _)| w.item.name)
+            .collect();
         assert_eq!(order, ["a0", "b0", "a1", "a2"]);
     }
 

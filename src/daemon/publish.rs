@@ -59,8 +59,7 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
     loop {
         let after = published.get(&collection).copied().unwrap_or(0);
         let name = collection.clone();
-        let events =
-            blocking(daemon, move |d| d.library.events_since(&name, after, BATCH)).await;
+        let events = blocking(daemon, move |d| d.library.events_since(&name, after, BATCH)).await;
         let events = match events {
             Ok(Ok(events)) => events,
             Ok(Err(e)) => {
@@ -84,10 +83,12 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
 }
 
 fn send_heartbeat(daemon: &Daemon, published: &BTreeMap<String, u64>) {
-    let collections = published.iter().map(|(collection, &sequence)| wire::CollectionSequence {
-        collection: collection.clone(),
-        sequence,
-    });
+    let collections = published
+        .iter()
+        .map(|(collection, &sequence)| wire::CollectionSequence {
+            collection: collection.clone(),
+            sequence,
+        });
     let heartbeat = wire::Heartbeat {
         collections: collections.collect(),
         instance: daemon.instance.clone(),
@@ -97,5 +98,7 @@ fn send_heartbeat(daemon: &Daemon, published: &BTreeMap<String, u64>) {
         collection: String::new(),
         kind: Some(Kind::Heartbeat(heartbeat)),
     };
-    daemon.outbox.event(HEARTBEAT_TOPIC.to_vec(), event.encode_to_vec());
+    daemon
+        .outbox
+        .event(HEARTBEAT_TOPIC.to_vec(), event.encode_to_vec());
 }

@@ -43,16 +43,22 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
         }
         Body::GetJob(r) => {
             let job = library.job(r.job_id).map_err(refuse)?;
-            Reply::GetJob(wire::GetJobReply { job: Some(daemon.job_to_wire(&job)) })
+            Reply::GetJob(wire::GetJobReply {
+                job: Some(daemon.job_to_wire(&job)),
+            })
         }
         Body::ListShapes(r) => Reply::ListShapes(list_shapes(daemon, &r)?),
         Body::GetShape(r) => {
             let shape = library.shape(&r.collection, &r.shape).map_err(refuse)?;
-            Reply::GetShape(wire::GetShapeReply { shape: Some(convert::shape(&shape)) })
+            Reply::GetShape(wire::GetShapeReply {
+                shape: Some(convert::shape(&shape)),
+            })
         }
         Body::GetLabels(r) => {
             let version = Some(r.version).filter(|&v| v > 0);
-            let labels = library.labels(&r.collection, &r.shape, version).map_err(refuse)?;
+            let labels = library
+                .labels(&r.collection, &r.shape, version)
+                .map_err(refuse)?;
             Reply::GetLabels(convert::labels(&labels, r.confidence, &mut frames))
         }
         Body::GetOriginal(r) => {
@@ -65,16 +71,22 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
         }
         Body::GetSpectrum(r) => {
             let area = library.shape(&r.collection, &r.shape).map_err(refuse)?.area;
-            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            let description = library
+                .description(&r.collection, &r.shape)
+                .map_err(refuse)?;
             let view = description.view();
             Reply::GetSpectrum(convert::spectrum(&view, area, r.eigenvectors, &mut frames))
         }
         Body::GetHks(r) => {
-            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            let description = library
+                .description(&r.collection, &r.shape)
+                .map_err(refuse)?;
             Reply::GetHks(convert::hks(&description.view(), &mut frames))
         }
         Body::GetDescriptors(r) => {
-            let description = library.description(&r.collection, &r.shape).map_err(refuse)?;
+            let description = library
+                .description(&r.collection, &r.shape)
+                .map_err(refuse)?;
             Reply::GetDescriptors(convert::descriptors(&description.view(), &mut frames))
         }
         Body::GetFunctionalMap(r) => {
@@ -89,7 +101,9 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
         }
         Body::Nearest(r) => {
             let limit = page("limit", r.limit, DEFAULT_NEIGHBORS)?;
-            let nearest = library.nearest(&r.collection, &r.shape, limit).map_err(refuse)?;
+            let nearest = library
+                .nearest(&r.collection, &r.shape, limit)
+                .map_err(refuse)?;
             Reply::Nearest(convert::nearest(nearest))
         }
         Body::EventsSince(r) => Reply::EventsSince(events_since(daemon, &r)?),
@@ -132,11 +146,16 @@ fn list_shapes(
         })?,
     };
     // One more tells whether there is another page.
-    let mut shapes =
-        daemon.library.shapes(&r.collection, after, size + 1, r.label).map_err(refuse)?;
+    let mut shapes = daemon
+        .library
+        .shapes(&r.collection, after, size + 1, r.label)
+        .map_err(refuse)?;
     let more = shapes.len() > size;
     shapes.truncate(size);
-    let last = shapes.last().filter(|_| more).map(|s| s.ordinal.to_string());
+    let last = shapes
+        .last()
+        .filter(|_| more)
+        .map(|s| s.ordinal.to_string());
     Ok(wire::ListShapesReply {
         shapes: shapes.iter().map(convert::shape).collect(),
         next_page_token: last.unwrap_or_default(),
@@ -148,11 +167,16 @@ fn events_since(
     r: &wire::EventsSinceRequest,
 ) -> Result<wire::EventsSinceReply, wire::Error> {
     let limit = page("limit", r.limit, MAX_PAGE)?;
-    let mut events =
-        daemon.library.events_since(&r.collection, r.sequence, limit + 1).map_err(refuse)?;
+    let mut events = daemon
+        .library
+        .events_since(&r.collection, r.sequence, limit + 1)
+        .map_err(refuse)?;
     let more = events.len() > limit;
     events.truncate(limit);
-    let events = events.iter().map(|e| convert::event(&r.collection, e)).collect();
+    let events = events
+        .iter()
+        .map(|e| convert::event(&r.collection, e))
+        .collect();
     Ok(wire::EventsSinceReply { events, more })
 }
 
@@ -209,8 +233,12 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
 
 /// Resident memory of this process as the kernel counts it; 0 if it does not say.
 fn resident_bytes() -> u64 {
-    let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return 0 };
-    let kib = status.lines().find_map(|l| l.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB"));
+    let Ok(status) = std::fs::read_to_string("/proc/self/status") else {
+        return 0;
+    };
+    let kib = status
+        .lines()
+        .find_map(|l| l.strip_prefix("VmRSS:")?.trim().strip_suffix(" kB"));
     kib.and_then(|n| n.parse::<u64>().ok()).unwrap_or(0) << 10
 }
 

@@ -91,7 +91,9 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
                     let reader = readers.acquire_owned().await;
                     let _reader = reader.expect("invariant: the semaphore is never closed");
-                    blocking(&d, move |d| reads::answer(d, body)).await.unwrap_or_else(panicked)
+                    blocking(&d, move |d| reads::answer(d, body))
+                        .await
+                        .unwrap_or_else(panicked)
                 }));
             }
         }
@@ -103,16 +105,21 @@ async fn change_in_order(
     daemon: Arc<Daemon>,
     mut changes: mpsc::UnboundedReceiver<(Body, InHand)>,
 ) {
-    while let Some((body, in_hand)) = changes.recv().await {
-        let request = &in_hand.incoming.request;
-        let key = writes::key(request);
-        let frames = in_hand.incoming.frames.clone();
+    while let Some((body, mut in_hand)) = changes.recv().await {
         if in_hand.is_late() {
             in_hand.late(&daemon, None);
             continue;
         }
-        let done =
-            blocking(&daemon, move |d| writes::change(d, &body, &frames, key.as_ref())).await;
+        let key = writes::key(&in_hand.incoming.request);
+        let frames = std::mem::take(&mut in_hand.incoming.frames);
+        // Given back when the change is made: who waits for the placing holds no frames.
+        let memory = in_hand.incoming.memory.take();
+        let done = blocking(&daemon, move |d| {
+            let _memory = memory;
+            let (body, frames) = (body, frames);
+            writes::change(d, &body, &frames, key.as_ref())
+        });
+        let done = done.await;
         match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
             Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((result, Vec::new()))),
             Ok(writes::Done::WhenPlaced(job)) => {
@@ -151,7 +158,13 @@ impl InHand {
 
     fn deadline(&self) -> Option<Instant> {
         let ms = self.incoming.request.deadline_ms;
-        (ms > 0).then(|| self.incoming.received.checked_add(Duration::from_millis(ms))).flatten()
+        (ms > 0)
+            .then(|| {
+                self.incoming
+                    .received
+                    .checked_add(Duration::from_millis(ms))
+            })
+            .flatten()
     }
 
     fn is_late(&self) -> bool {
@@ -188,15 +201,29 @@ impl Daemon {
                 (reply::Result::Error(error), Vec::new())
             }
         };
-        self.outbox.reply(peer, Reply { request_id, result: Some(result) }, frames);
+        self.outbox.reply(
+            peer,
+            Reply {
+                request_id,
+                result: Some(result),
+            },
+            frames,
+        );
     }
 
     /// A job with what this process knows of it.
     pub(crate) fn job_to_wire(&self, job: &Job) -> wire::Job {
         let progress = self.work.progress();
-        let items: Vec<_> =
-            job.items.iter().map(|i| convert::item(i, progress.stage(job.id, i.index))).collect();
-        let n_over = job.items.iter().filter(|i| convert::job_finished(&i.state)).count();
+        let items: Vec<_> = job
+            .items
+            .iter()
+            .map(|i| convert::item(i, progress.stage(job.id, i.index)))
+            .collect();
+        let n_over = job
+            .items
+            .iter()
+            .filter(|i| convert::job_finished(&i.state))
+            .count();
         wire::Job {
             job_id: job.id,
             collection: job.collection.clone(),
@@ -210,14 +237,21 @@ impl Daemon {
 }
 
 fn busy(message: &str) -> wire::Error {
-    let mut error =
-        convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, message);
+    let mut error = convert::error(
+        ErrorCode::ResourceExhausted,
+        ErrorReason::QueueFull,
+        message,
+    );
     error.retry_after_ms = BUSY_RETRY_MS;
     error
 }
 
 fn panic_error(panic: &str) -> wire::Error {
-    convert::error(ErrorCode::Internal, ErrorReason::Panic, format!("answering panicked: {panic}"))
+    convert::error(
+        ErrorCode::Internal,
+        ErrorReason::Panic,
+        format!("answering panicked: {panic}"),
+    )
 }
 
 fn panicked(panic: String) -> Answer {
@@ -234,7 +268,10 @@ pub(crate) fn draining() -> wire::Error {
 
 /// Reads a job and shows it.
 async fn read_job(daemon: &Arc<Daemon>, job: u64) -> Result<wire::Job, wire::Error> {
-    let read = blocking(daemon, move |d| d.library.job(job).map(|j| d.job_to_wire(&j))).await;
+    let read = blocking(daemon, move |d| {
+        d.library.job(job).map(|j| d.job_to_wire(&j))
+    })
+    .await;
     match read {
         Ok(Ok(job)) => Ok(job),
         Ok(Err(e)) => Err(convert::library_error(&e)),
@@ -254,7 +291,10 @@ async fn wait_placed(daemon: &Arc<Daemon>, job: u64) -> Answer {
     }
     let job = read_job(daemon, job).await?;
     if !job.finished {
-        return Err(convert::with_subject(draining(), Subject::JobId(job.job_id)));
+        return Err(convert::with_subject(
+            draining(),
+            Subject::JobId(job.job_id),
+        ));
     }
     let reply = convert::add_shapes(job.job_id, job.items.len(), Some(job));
     Ok((reply::Result::AddShapes(reply), Vec::new()))
@@ -265,7 +305,11 @@ fn wait_limit(ms: u64) -> Result<Duration, wire::Error> {
         return Ok(Duration::from_millis(ms));
     }
     let text = format!("wait_ms is {ms}, the limit is {MAX_WAIT_MS}");
-    Err(convert::field_error(ErrorReason::FieldRange, "wait_ms", text))
+    Err(convert::field_error(
+        ErrorReason::FieldRange,
+        "wait_ms",
+        text,
+    ))
 }
 
 async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Answer {
@@ -280,7 +324,11 @@ async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Ans
             break;
         }
         let pace = begin + WATCH_PACE;
-        let wake = if revision == request.revision { until } else { pace.min(until) };
+        let wake = if revision == request.revision {
+            until
+        } else {
+            pace.min(until)
+        };
         tokio::select! {
             _ = changes.changed() => {}
             () = tokio::time::sleep_until(wake) => {
@@ -292,7 +340,10 @@ async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Ans
         }
     }
     let job = read_job(daemon, request.job_id).await?;
-    Ok((reply::Result::WatchJob(wire::WatchJobReply { job: Some(job) }), Vec::new()))
+    Ok((
+        reply::Result::WatchJob(wire::WatchJobReply { job: Some(job) }),
+        Vec::new(),
+    ))
 }
 
 async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Answer {
@@ -312,7 +363,11 @@ async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Ans
         let idle = n_stale == 0 && n_queued == 0;
         let over = idle || tokio::time::Instant::now() >= until || daemon.is_draining();
         if over {
-            let reply = wire::WaitIdleReply { idle, n_queued, n_stale };
+            let reply = wire::WaitIdleReply {
+                idle,
+                n_queued,
+                n_stale,
+            };
             return Ok((reply::Result::WaitIdle(reply), Vec::new()));
         }
         // Shapes in work change their stage often; only the last one's end matters.

@@ -59,7 +59,11 @@ pub fn serve(
         .name("signals".to_owned())
         .spawn(move || {
             for signal in signals.forever() {
-                let told = if signal == SIGHUP { Control::Reload } else { Control::Drain };
+                let told = if signal == SIGHUP {
+                    Control::Reload
+                } else {
+                    Control::Drain
+                };
                 if control.send(told).is_err() {
                     return;
                 }

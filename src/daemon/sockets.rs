@@ -58,13 +58,20 @@ pub(crate) struct Incoming {
     pub(crate) request: Request,
     pub(crate) frames: Vec<Bytes>,
     pub(crate) received: Instant,
-    /// Given back when the request is dropped.
-    pub(crate) _memory: Reservation,
+    /// Held for as long as the frames are.
+    pub(crate) memory: Option<Reservation>,
 }
 
 enum Outgoing {
-    Reply { peer: Peer, reply: Box<Reply>, frames: Vec<Bytes> },
-    Event { topic: Vec<u8>, body: Vec<u8> },
+    Reply {
+        peer: Peer,
+        reply: Box<Reply>,
+        frames: Vec<Bytes>,
+    },
+    Event {
+        topic: Vec<u8>,
+        body: Vec<u8>,
+    },
     Stop,
 }
 
@@ -76,7 +83,11 @@ pub(crate) struct Outbox {
 
 impl Outbox {
     pub(crate) fn reply(&self, peer: Peer, reply: Reply, frames: Vec<Bytes>) {
-        self.push(Outgoing::Reply { peer, reply: Box::new(reply), frames });
+        self.push(Outgoing::Reply {
+            peer,
+            reply: Box::new(reply),
+            frames,
+        });
     }
 
     pub(crate) fn event(&self, topic: Vec<u8>, body: Vec<u8>) {
@@ -117,7 +128,10 @@ pub(crate) struct Bound {
 pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartError> {
     endpoint.check_servable()?;
     let context = zmq::Context::new();
-    let failed = |source| StartError::Socket { endpoint: endpoint.to_string(), source };
+    let failed = |source| StartError::Socket {
+        endpoint: endpoint.to_string(),
+        source,
+    };
     let sockets = || {
         let router = context.socket(zmq::ROUTER)?;
         router.set_router_mandatory(true)?;
@@ -131,7 +145,10 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
             socket.set_linger(LINGER_MS)?;
             socket.set_heartbeat_ivl(HEARTBEAT_MS)?;
             socket.set_heartbeat_timeout(HEARTBEAT_TIMEOUT_MS)?;
-            socket.set_ipv6(true)?;
+            // Not for an IPv4 address, which would come back as one mapped into IPv6.
+            socket.set_ipv6(
+                matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('[')),
+            )?;
         }
         let (wake, wake_sender) = (context.socket(zmq::PULL)?, context.socket(zmq::PUSH)?);
         wake.bind("inproc://wake")?;
@@ -145,7 +162,10 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
         if let Endpoint::Ipc(path) = endpoint {
             locks.push(claim_socket(path)?);
         }
-        let failed = |source| StartError::Socket { endpoint: endpoint.to_string(), source };
+        let failed = |source| StartError::Socket {
+            endpoint: endpoint.to_string(),
+            source,
+        };
         let uri = match endpoint {
             Endpoint::Tcp { host, port: 0 } => format!("tcp://{host}:*"),
             other => other.to_string(),
@@ -159,15 +179,29 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
             }
             Endpoint::Tcp { .. } => {
                 let last = socket.get_last_endpoint().map_err(failed)?;
-                Ok(Endpoint::parse(&last.map_err(|_| failed(zmq::Error::EINVAL))?)?)
+                Ok(Endpoint::parse(
+                    &last.map_err(|_| failed(zmq::Error::EINVAL))?,
+                )?)
             }
         }
     };
     let endpoint = listen(&router, endpoint)?;
     let events = listen(&publisher, &endpoint.events()?)?;
     let (sender, queue) = mpsc::channel();
-    let outbox = Arc::new(Outbox { queue: sender, wake: Mutex::new(wake_sender) });
-    Ok(Bound { router, publisher, wake, queue, outbox, endpoint, events, locks })
+    let outbox = Arc::new(Outbox {
+        queue: sender,
+        wake: Mutex::new(wake_sender),
+    });
+    Ok(Bound {
+        router,
+        publisher,
+        wake,
+        queue,
+        outbox,
+        endpoint,
+        events,
+        locks,
+    })
 }
 
 /// What the socket thread shares with the daemon.
@@ -190,8 +224,15 @@ pub(crate) fn serve(
         max_frames: MAX_FRAMES,
         max_header_bytes: MAX_HEADER_BYTES,
     };
-    let thread = SocketThread { bound, shared, requests, limits };
-    std::thread::Builder::new().name("sockets".to_owned()).spawn(move || thread.run())
+    let thread = SocketThread {
+        bound,
+        shared,
+        requests,
+        limits,
+    };
+    std::thread::Builder::new()
+        .name("sockets".to_owned())
+        .spawn(move || thread.run())
 }
 
 struct SocketThread {
@@ -219,7 +260,11 @@ impl SocketThread {
             while self.bound.wake.recv_msg(zmq::DONTWAIT).is_ok() {}
             while let Ok(outgoing) = self.bound.queue.try_recv() {
                 match outgoing {
-                    Outgoing::Reply { peer, reply, frames } => self.reply(&peer, &reply, frames),
+                    Outgoing::Reply {
+                        peer,
+                        reply,
+                        frames,
+                    } => self.reply(&peer, &reply, frames),
                     Outgoing::Event { topic, body } => self.publish(topic, body),
                     Outgoing::Stop => return,
                 }
@@ -228,7 +273,9 @@ impl SocketThread {
                 match frames::receive(&self.bound.router, zmq::DONTWAIT, &self.limits, N_LEADING) {
                     Ok(Ok(message)) => self.request(message),
                     Ok(Err((leading, e))) => {
-                        let Some((peer, header, _)) = split(leading) else { continue };
+                        let Some((peer, header, _)) = split(leading) else {
+                            continue;
+                        };
                         let id = Request::decode(header).unwrap_or_default().request_id;
                         self.refuse(&peer, id, convert::frame_error(&e));
                     }
@@ -246,17 +293,22 @@ impl SocketThread {
     fn request(&self, message: Vec<Bytes>) {
         let received = Instant::now();
         let n_bytes = message.iter().map(|f| f.len() as u64).sum();
-        let Some((peer, header, frames)) = split(message) else { return };
-        let invalid = |reason, text: String| {
-            convert::error(ErrorCode::InvalidArgument, reason, text)
+        let Some((peer, header, frames)) = split(message) else {
+            return;
         };
+        let invalid =
+            |reason, text: String| convert::error(ErrorCode::InvalidArgument, reason, text);
         if header.len() as u64 > self.limits.max_header_bytes {
             let text = format!(
                 "the header frame has {} bytes, the limit is {}",
                 header.len(),
                 self.limits.max_header_bytes
             );
-            return self.refuse(&peer, String::new(), invalid(ErrorReason::MessageTooLarge, text));
+            return self.refuse(
+                &peer,
+                String::new(),
+                invalid(ErrorReason::MessageTooLarge, text),
+            );
         }
         let request = match Request::decode(header) {
             Ok(request) => request,
@@ -266,7 +318,10 @@ impl SocketThread {
                 return self.refuse(&peer, String::new(), error);
             }
         };
-        for (field, id) in [("request_id", &request.request_id), ("client_id", &request.client_id)] {
+        for (field, id) in [
+            ("request_id", &request.request_id),
+            ("client_id", &request.client_id),
+        ] {
             let found = id.chars().count();
             if found > MAX_ID_CHARS {
                 let text = format!("{field} has {found} characters, the limit is {MAX_ID_CHARS}");
@@ -278,7 +333,13 @@ impl SocketThread {
             let text = format!("requests in hand leave no memory for {n_bytes} bytes more");
             return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
         };
-        let incoming = Incoming { peer, request, frames, received, _memory: memory };
+        let incoming = Incoming {
+            peer,
+            request,
+            frames,
+            received,
+            memory: Some(memory),
+        };
         if let Err(refused) = self.requests.try_send(incoming) {
             let incoming = refused.into_inner();
             let text = "too many requests wait".to_owned();
@@ -295,12 +356,18 @@ impl SocketThread {
     }
 
     fn refuse(&self, peer: &Peer, request_id: String, error: wire::Error) {
-        let reply = Reply { request_id, result: Some(reply::Result::Error(error)) };
+        let reply = Reply {
+            request_id,
+            result: Some(reply::Result::Error(error)),
+        };
         self.reply(peer, &reply, Vec::new());
     }
 
     fn reply(&self, peer: &Peer, reply: &Reply, frames: Vec<Bytes>) {
-        self.shared.counters.requests.fetch_add(1, Ordering::Relaxed);
+        self.shared
+            .counters
+            .requests
+            .fetch_add(1, Ordering::Relaxed);
         let mut parts = vec![zmq::Message::from(&peer.identity[..])];
         if peer.delimiter {
             parts.push(zmq::Message::new());
@@ -310,7 +377,10 @@ impl SocketThread {
         match frames::send(&self.bound.router, parts, zmq::DONTWAIT) {
             Ok(()) => {}
             Err(zmq::Error::EHOSTUNREACH) => {
-                tracing::debug!(request = reply.request_id, "the client left before its reply");
+                tracing::debug!(
+                    request = reply.request_id,
+                    "the client left before its reply"
+                );
             }
             // It asks again under the same request id when it reads again.
             Err(e) => tracing::warn!(request = reply.request_id, error = %e, "a reply was dropped"),
@@ -343,5 +413,12 @@ fn split(message: Vec<Bytes>) -> Option<(Peer, Bytes, Vec<Bytes>)> {
     // A DEALER's message with an empty header and frames would be a request without a body anyway.
     let delimiter = first.is_empty() && parts.peek().is_some();
     let header = if delimiter { parts.next()? } else { first };
-    Some((Peer { identity, delimiter }, header, parts.collect()))
+    Some((
+        Peer {
+            identity,
+            delimiter,
+        },
+        header,
+        parts.collect(),
+    ))
 }

@@ -94,7 +94,12 @@ impl Daemon {
         }
         let items = job.items.iter().zip(n_bytes);
         self.take_up_items(
-            items.map(|(item, &n_bytes)| Waiting { item: item.clone(), n_bytes }).collect(),
+            items
+                .map(|(item, &n_bytes)| Waiting {
+                    item: item.clone(),
+                    n_bytes,
+                })
+                .collect(),
         );
     }
 
@@ -105,7 +110,11 @@ impl Daemon {
                 continue;
             }
             self.ensure_lane(&waiting.item.collection);
-            self.work.progress().push(waiting);
+            let mut progress = self.work.progress();
+            // Without a lane the daemon drains, and the shape is taken up at the next start.
+            if progress.lane(&waiting.item.collection).is_some() {
+                progress.push(waiting);
+            }
         }
         self.work.changed();
         self.work.arrived.notify_one();
@@ -129,7 +138,11 @@ impl Daemon {
         let (sender, receiver) = mpsc::unbounded_channel();
         progress.add_lane(collection, sender);
         let lane = place_in_order(Arc::clone(self), collection.to_owned(), receiver);
-        let mut lanes = self.work.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut lanes = self
+            .work
+            .lanes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         while lanes.try_join_next().is_some() {}
         lanes.spawn(lane);
     }
@@ -139,7 +152,9 @@ impl Daemon {
         let mut progress = self.work.progress();
         progress.cancel(job.id);
         progress.drop_waiting(job.id, |index| {
-            job.items.iter().any(|i| i.index == index && convert::job_finished(&i.state))
+            job.items
+                .iter()
+                .any(|i| i.index == index && convert::job_finished(&i.state))
         });
         drop(progress);
         self.work.changed();
@@ -147,8 +162,13 @@ impl Daemon {
 
     /// Waits until every lane has ended. For draining: the lanes must have been closed.
     pub(crate) async fn lanes_ended(&self) {
-        let mut lanes =
-            std::mem::take(&mut *self.work.lanes.lock().unwrap_or_else(PoisonError::into_inner));
+        let mut lanes = std::mem::take(
+            &mut *self
+                .work
+                .lanes
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner),
+        );
         while lanes.join_next().await.is_some() {}
     }
 }
@@ -176,10 +196,19 @@ async fn hand_out(daemon: &Arc<Daemon>) {
                 None => arrived.await,
             }
         };
-        let memory = daemon.describe_memory.reserve(Limits::to_describe(waiting.n_bytes)).await;
+        let memory = daemon
+            .describe_memory
+            .reserve(Limits::to_describe(waiting.n_bytes))
+            .await;
         let (sender, prepared) = oneshot::channel();
         // Told before describing begins, so that the lane has its shapes in order of acceptance.
-        if lane.send(Step::Place(Ready { item: waiting.item.clone(), prepared })).is_err() {
+        if lane
+            .send(Step::Place(Ready {
+                item: waiting.item.clone(),
+                prepared,
+            }))
+            .is_err()
+        {
             continue;
         }
         let daemon = Arc::clone(daemon);
@@ -223,7 +252,9 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
             && begin.elapsed() < limit
             && !daemon.work.progress().is_cancelled(item.job)
     };
-    let outcome = catch_unwind(AssertUnwindSafe(|| daemon.library.describe_item(item, &stage)));
+    let outcome = catch_unwind(AssertUnwindSafe(|| {
+        daemon.library.describe_item(item, &stage)
+    }));
     match outcome {
         Ok(Ok(described)) => Ok(described),
         Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
@@ -251,7 +282,12 @@ fn bytes_of(d: &Description) -> u64 {
 }
 
 fn failed(code: &str, reason: &str, message: String) -> Failure {
-    Failure { code: code.to_owned(), reason: reason.to_owned(), message, subject: None }
+    Failure {
+        code: code.to_owned(),
+        reason: reason.to_owned(),
+        message,
+        subject: None,
+    }
 }
 
 fn cancelled() -> Failure {
@@ -260,7 +296,11 @@ fn cancelled() -> Failure {
 }
 
 fn panicked(text: &str) -> Failure {
-    failed("INTERNAL", "PANIC", format!("the work on this shape panicked: {text}"))
+    failed(
+        "INTERNAL",
+        "PANIC",
+        format!("the work on this shape panicked: {text}"),
+    )
 }
 
 /// A collection's lane.
@@ -299,8 +339,12 @@ async fn place_in_order(
             }
         };
         // Draining: this shape and all after it stay queued.
-        let Ok((prepared, _memory)) = prepared else { return };
-        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else { return };
+        let Ok((prepared, _memory)) = prepared else {
+            return;
+        };
+        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else {
+            return;
+        };
         if !place(&daemon, &ready.item, outcome).await {
             return;
         }
@@ -318,7 +362,11 @@ async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Opt
     let settled = blocking(daemon, move |d| match prepare(d, &subject) {
         Prepared::Described(outcome) => outcome,
         // The library sees by itself why, before it looks at this.
-        Prepared::NotNeeded => Err(failed("INTERNAL", "GONE", "it was not described".to_owned())),
+        Prepared::NotNeeded => Err(failed(
+            "INTERNAL",
+            "GONE",
+            "it was not described".to_owned(),
+        )),
     });
     let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
     (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
@@ -362,8 +410,11 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
         if outcome.is_err() {
             // Not even the failure can be recorded: the collection or the job is gone.
             tracing::warn!(
-                collection = item.collection, shape = item.name, job = item.job,
-                message = failure.message, "a shape was dropped"
+                collection = item.collection,
+                shape = item.name,
+                job = item.job,
+                message = failure.message,
+                "a shape was dropped"
             );
             break;
         }
@@ -384,7 +435,14 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
         ),
         ItemState::Failed(f) => {
             daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
-            tracing::warn!(collection, shape, code = f.code, reason = f.reason, message = f.message, "failed");
+            tracing::warn!(
+                collection,
+                shape,
+                code = f.code,
+                reason = f.reason,
+                message = f.message,
+                "failed"
+            );
         }
         ItemState::Cancelled => tracing::info!(collection, shape, "cancelled"),
         ItemState::Queued | ItemState::Running(_) => {

@@ -8,9 +8,7 @@ use crate::daemon::service::Control;
 use crate::ipc::convert;
 use crate::ipc::endpoint::Endpoint;
 use crate::ipc::frames::FrameReader;
-use crate::ipc::wire::{
-    self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body,
-};
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body};
 use crate::library::{LibraryError, RequestKey};
 use bytes::Bytes;
 use std::io::Read as _;
@@ -52,7 +50,11 @@ pub(crate) fn change(
     }
     if key.is_some_and(|k| k.request_id.is_empty()) {
         let text = "a change by a named client needs a request_id";
-        return Err(convert::field_error(ErrorReason::FieldMissing, "request_id", text));
+        return Err(convert::field_error(
+            ErrorReason::FieldMissing,
+            "request_id",
+            text,
+        ));
     }
     let library = &daemon.library;
     let reply = match body {
@@ -67,19 +69,26 @@ pub(crate) fn change(
             Reply::CreateCollection(wire::CreateCollectionReply { collection })
         }
         Body::DeleteCollection(r) => {
-            library.delete_collection(&r.collection, key).map_err(refuse)?;
+            library
+                .delete_collection(&r.collection, key)
+                .map_err(refuse)?;
             daemon.work.progress().remove_idle_lane(&r.collection);
             daemon.notice(Notice::Changed(r.collection.clone()));
             Reply::DeleteCollection(wire::DeleteCollectionReply {})
         }
         Body::NameLabel(r) => {
-            let label =
-                library.name_label(&r.collection, r.label, &r.name, key).map_err(refuse)?;
+            let label = library
+                .name_label(&r.collection, r.label, &r.name, key)
+                .map_err(refuse)?;
             daemon.notice(Notice::Changed(r.collection.clone()));
-            Reply::NameLabel(wire::NameLabelReply { label: Some(convert::label_info(&label)) })
+            Reply::NameLabel(wire::NameLabelReply {
+                label: Some(convert::label_info(&label)),
+            })
         }
         Body::RemoveShape(r) => {
-            library.remove(&r.collection, &r.shape, key).map_err(refuse)?;
+            library
+                .remove(&r.collection, &r.shape, key)
+                .map_err(refuse)?;
             daemon.notice(Notice::Changed(r.collection.clone()));
             // Those that carried its labels over may be stale now.
             daemon.nudge(&r.collection);
@@ -88,7 +97,9 @@ pub(crate) fn change(
         Body::CancelJob(r) => {
             let job = library.cancel(r.job_id).map_err(refuse)?;
             daemon.forget_cancelled(&job);
-            Reply::CancelJob(wire::CancelJobReply { job: Some(daemon.job_to_wire(&job)) })
+            Reply::CancelJob(wire::CancelJobReply {
+                job: Some(daemon.job_to_wire(&job)),
+            })
         }
         Body::AddShapes(r) => return add_shapes(daemon, r, frames, key),
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
@@ -129,8 +140,7 @@ fn add_shapes(
             "{n_queued} shapes are queued and {n} more asked for, the limit is {}",
             limits.max_queued_shapes
         );
-        let mut error =
-            convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, text);
+        let mut error = convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, text);
         error.retry_after_ms = QUEUE_RETRY_MS;
         daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
         return Err(error);
@@ -147,13 +157,16 @@ fn add_shapes(
         ensure_collection(daemon, &request.collection, create)?;
     }
     let n_bytes: Vec<u64> = shapes.iter().map(|s| s.bytes.len() as u64).collect();
-    let job = daemon.library.submit(&request.collection, shapes, key).map_err(refuse)?;
+    let job = daemon
+        .library
+        .submit(&request.collection, shapes, key)
+        .map_err(refuse)?;
     daemon.take_up(&job, &n_bytes);
     match request.mode() {
         wire::AddMode::Wait => Ok(Done::WhenPlaced(job.id)),
-        wire::AddMode::Job | wire::AddMode::Unspecified => {
-            Ok(Done::Now(Reply::AddShapes(convert::add_shapes(job.id, job.items.len(), None))))
-        }
+        wire::AddMode::Job | wire::AddMode::Unspecified => Ok(Done::Now(Reply::AddShapes(
+            convert::add_shapes(job.id, job.items.len(), None),
+        ))),
     }
 }
 
@@ -165,9 +178,16 @@ fn ensure_collection(
 ) -> Result<(), wire::Error> {
     if !wish.name.is_empty() && wish.name != name {
         let text = format!("create.name is {:?}, but collection is {name:?}", wish.name);
-        return Err(convert::field_error(ErrorReason::FieldRange, "create.name", text));
+        return Err(convert::field_error(
+            ErrorReason::FieldRange,
+            "create.name",
+            text,
+        ));
     }
-    let named = wire::CollectionSpec { name: name.to_owned(), ..wish.clone() };
+    let named = wire::CollectionSpec {
+        name: name.to_owned(),
+        ..wish.clone()
+    };
     let spec = convert::collection_spec(&named, "create")?;
     match daemon.library.collection(name) {
         Ok(is) => match convert::collection_differs(&named, &is.spec) {
@@ -179,7 +199,10 @@ fn ensure_collection(
             }
         },
         Err(LibraryError::NotFound { .. }) => {
-            let info = daemon.library.create_collection(&spec, None).map_err(refuse)?;
+            let info = daemon
+                .library
+                .create_collection(&spec, None)
+                .map_err(refuse)?;
             daemon.notice(Notice::Created(name.to_owned(), info.sequence));
             Ok(())
         }
@@ -194,24 +217,40 @@ fn read_allowed(
     max_bytes: u64,
 ) -> Result<Vec<u8>, wire::Error> {
     let forbidden = || {
-        let text = format!("{} is not below a directory of ingest.paths", path.display());
-        convert::error(ErrorCode::PermissionDenied, ErrorReason::PathForbidden, text)
+        let text = format!(
+            "{} is not below a directory of ingest.paths",
+            path.display()
+        );
+        convert::error(
+            ErrorCode::PermissionDenied,
+            ErrorReason::PathForbidden,
+            text,
+        )
     };
     if !path.is_absolute() || !config::is_below(path, roots) {
         return Err(forbidden());
     }
     let unreadable = |text: String| {
-        convert::error(ErrorCode::InvalidArgument, ErrorReason::PathUnreadable, text)
+        convert::error(
+            ErrorCode::InvalidArgument,
+            ErrorReason::PathUnreadable,
+            text,
+        )
     };
     let io = |e: std::io::Error| unreadable(format!("{}: {e}", path.display()));
     let resolved = path.canonicalize().map_err(io)?;
     // A pipe or a device could block for ever or never end.
     if !std::fs::metadata(&resolved).map_err(io)?.is_file() {
-        return Err(unreadable(format!("{} is not a regular file", path.display())));
+        return Err(unreadable(format!(
+            "{} is not a regular file",
+            path.display()
+        )));
     }
     let file = std::fs::File::open(&resolved).map_err(io)?;
     let mut bytes = Vec::new();
     // One byte more shows that the file is too large.
-    file.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(io)?;
+    file.take(max_bytes.saturating_add(1))
+        .read_to_end(&mut bytes)
+        .map_err(io)?;
     Ok(bytes)
 }

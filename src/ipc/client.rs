@@ -31,11 +31,18 @@ pub enum ClientError {
     #[error("{}", .0.message)]
     Refused(Box<wire::Error>),
     #[error("the message has {found} {what}, the daemon's limit is {limit}")]
-    TooLarge { what: &'static str, found: u64, limit: u64 },
+    TooLarge {
+        what: &'static str,
+        found: u64,
+        limit: u64,
+    },
     #[error("the daemon's reply cannot be understood: {0}")]
     BadReply(String),
     #[error("{endpoint}: {source}")]
-    Socket { endpoint: String, source: zmq::Error },
+    Socket {
+        endpoint: String,
+        source: zmq::Error,
+    },
 }
 
 /// A reply's result and its raw frames.
@@ -62,7 +69,15 @@ impl Client {
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let nanos = since.map_or(0, |d| d.as_nanos());
         let client_id = format!("rust-{}-{nanos:x}", std::process::id());
-        Ok(Self { context, socket, endpoint, client_id, n_requests: 0, timeout, hello: None })
+        Ok(Self {
+            context,
+            socket,
+            endpoint,
+            client_id,
+            n_requests: 0,
+            timeout,
+            hello: None,
+        })
     }
 
     /// Takes another name than the unique one made up by [`Client::connect`], for callers that repeat
@@ -117,7 +132,10 @@ impl Client {
                 };
             }
         }
-        Err(ClientError::NoAnswer { endpoint: self.endpoint.to_string(), timeout: self.timeout })
+        Err(ClientError::NoAnswer {
+            endpoint: self.endpoint.to_string(),
+            timeout: self.timeout,
+        })
     }
 
     /// The same, but a daemon that is at a limit is asked again after the delay it names, for as long
@@ -156,8 +174,10 @@ impl Client {
     /// A socket that receives the events of `collection`, or of all, and heartbeats.
     pub fn subscribe(&mut self, collection: Option<&str>) -> Result<zmq::Socket, ClientError> {
         let endpoint = self.hello()?.event_endpoint.clone();
-        let socket_error =
-            |source| ClientError::Socket { endpoint: endpoint.clone(), source };
+        let socket_error = |source| ClientError::Socket {
+            endpoint: endpoint.clone(),
+            source,
+        };
         let socket = self.context.socket(zmq::SUB).map_err(socket_error)?;
         let subscribe = || {
             socket.set_linger(LINGER_MS)?;
@@ -182,7 +202,11 @@ impl Client {
         for (what, found, limit) in [
             ("bytes", n_bytes, limits.max_message_bytes),
             ("frames", frames.len() as u64, u64::from(limits.max_frames)),
-            ("bytes of header", header.len() as u64, limits.max_header_bytes),
+            (
+                "bytes of header",
+                header.len() as u64,
+                limits.max_header_bytes,
+            ),
         ] {
             if found > limit {
                 return Err(ClientError::TooLarge { what, found, limit });
@@ -200,21 +224,27 @@ impl Client {
         request_id: &str,
         until: Instant,
     ) -> Result<Option<(Reply, Vec<Bytes>)>, ClientError> {
-        let socket_error =
-            |source| ClientError::Socket { endpoint: self.endpoint.to_string(), source };
+        let socket_error = |source| ClientError::Socket {
+            endpoint: self.endpoint.to_string(),
+            source,
+        };
         let parts = std::iter::once(header).chain(frames.iter().map(AsRef::as_ref));
         let left = |until: Instant| {
             let ms = until.saturating_duration_since(Instant::now()).as_millis();
             i32::try_from(ms).unwrap_or(i32::MAX)
         };
-        self.socket.set_sndtimeo(left(until)).map_err(socket_error)?;
+        self.socket
+            .set_sndtimeo(left(until))
+            .map_err(socket_error)?;
         match frames::send(&self.socket, parts.map(zmq::Message::from).collect(), 0) {
             Ok(()) => {}
             Err(zmq::Error::EAGAIN) => return Ok(None),
             Err(e) => return Err(socket_error(e)),
         }
         loop {
-            self.socket.set_rcvtimeo(left(until)).map_err(socket_error)?;
+            self.socket
+                .set_rcvtimeo(left(until))
+                .map_err(socket_error)?;
             let message = match frames::receive(&self.socket, 0, &REPLY_LIMITS, 1) {
                 Ok(Ok(message)) => message,
                 Ok(Err((_, e))) => return Err(ClientError::BadReply(e.to_string())),
@@ -241,7 +271,10 @@ fn dealer(context: &zmq::Context, endpoint: &Endpoint) -> Result<zmq::Socket, Cl
         socket.connect(&endpoint.to_string())?;
         Ok(socket)
     };
-    connect().map_err(|source| ClientError::Socket { endpoint: endpoint.to_string(), source })
+    connect().map_err(|source| ClientError::Socket {
+        endpoint: endpoint.to_string(),
+        source,
+    })
 }
 
 /// A reply whose result does not belong to the request.

@@ -20,7 +20,11 @@ pub enum EndpointError {
     #[error("endpoint {uri:?}: {message}")]
     Malformed { uri: String, message: String },
     #[error("endpoint {uri:?}: its socket path has {found} bytes, the limit is {limit}")]
-    PathTooLong { uri: String, found: usize, limit: usize },
+    PathTooLong {
+        uri: String,
+        found: usize,
+        limit: usize,
+    },
     #[error(
         "endpoint {uri:?} is not loopback; connections are neither encrypted nor authenticated yet, \
          so only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
@@ -33,7 +37,10 @@ pub enum EndpointError {
     #[error("{path} exists and is not a socket")]
     NotASocket { path: String },
     #[error("{path}: {source}")]
-    Io { path: String, source: std::io::Error },
+    Io {
+        path: String,
+        source: std::io::Error,
+    },
 }
 
 /// A place to listen at or to connect to.
@@ -62,20 +69,26 @@ impl fmt::Display for Endpoint {
 impl Endpoint {
     /// Reads `ipc://PATH` (made absolute) or `tcp://HOST:PORT` (`*` as port: any free one).
     pub fn parse(uri: &str) -> Result<Self, EndpointError> {
-        let malformed =
-            |message: &str| EndpointError::Malformed { uri: uri.to_owned(), message: message.to_owned() };
+        let malformed = |message: &str| EndpointError::Malformed {
+            uri: uri.to_owned(),
+            message: message.to_owned(),
+        };
         if let Some(path) = uri.strip_prefix("ipc://") {
             if path.is_empty() || path == "*" {
                 return Err(malformed("name the path of a socket"));
             }
             if path.starts_with('@') {
-                return Err(malformed("an abstract socket has no permissions, name a path"));
+                return Err(malformed(
+                    "an abstract socket has no permissions, name a path",
+                ));
             }
             if path.ends_with('/') || path.contains('\0') {
                 return Err(malformed("the path must name a file"));
             }
-            let path = std::path::absolute(path)
-                .map_err(|source| EndpointError::Io { path: path.to_owned(), source })?;
+            let path = std::path::absolute(path).map_err(|source| EndpointError::Io {
+                path: path.to_owned(),
+                source,
+            })?;
             // The event socket's path is the longer one.
             let found = path.as_os_str().len() + EVENTS_SUFFIX.len();
             if found > MAX_SOCKET_PATH_BYTES {
@@ -88,26 +101,37 @@ impl Endpoint {
             return Ok(Self::Ipc(path));
         }
         if let Some(address) = uri.strip_prefix("tcp://") {
-            let (host, port) =
-                address.rsplit_once(':').ok_or_else(|| malformed("expected tcp://HOST:PORT"))?;
+            let (host, port) = address
+                .rsplit_once(':')
+                .ok_or_else(|| malformed("expected tcp://HOST:PORT"))?;
             let port = if port == "*" {
                 0
             } else {
-                port.parse().map_err(|_| malformed("the port is not a number from 0 to 65535"))?
+                port.parse()
+                    .map_err(|_| malformed("the port is not a number from 0 to 65535"))?
             };
             if host.is_empty() {
                 return Err(malformed("the host is missing"));
             }
-            return Ok(Self::Tcp { host: host.to_owned(), port });
+            return Ok(Self::Tcp {
+                host: host.to_owned(),
+                port,
+            });
         }
-        Err(EndpointError::Scheme { uri: uri.to_owned() })
+        Err(EndpointError::Scheme {
+            uri: uri.to_owned(),
+        })
     }
 
     /// Where a daemon listens, and where clients look, when nobody says otherwise:
     /// `$RUNTIME_DIRECTORY/coseg.sock` under a service manager, else
     /// `$XDG_RUNTIME_DIR/coseg/coseg.sock`, else `/tmp/coseg-UID/coseg.sock`.
     pub fn default_for_user() -> Self {
-        let variable = |name| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+        let variable = |name| {
+            std::env::var_os(name)
+                .filter(|v| !v.is_empty())
+                .map(PathBuf::from)
+        };
         let directory = variable("RUNTIME_DIRECTORY")
             .or_else(|| variable("XDG_RUNTIME_DIR").map(|d| d.join("coseg")))
             .unwrap_or_else(|| {
@@ -125,23 +149,40 @@ impl Endpoint {
                 events.push(EVENTS_SUFFIX);
                 Ok(Self::Ipc(events.into()))
             }
-            Self::Tcp { host, port: 0 } => Ok(Self::Tcp { host: host.clone(), port: 0 }),
+            Self::Tcp { host, port: 0 } => Ok(Self::Tcp {
+                host: host.clone(),
+                port: 0,
+            }),
             Self::Tcp { host, port } => {
-                let port = port.checked_add(1).ok_or_else(|| EndpointError::Malformed {
-                    uri: self.to_string(),
-                    message: "the next port is for events, and there is none".to_owned(),
-                })?;
-                Ok(Self::Tcp { host: host.clone(), port })
+                let port = port
+                    .checked_add(1)
+                    .ok_or_else(|| EndpointError::Malformed {
+                        uri: self.to_string(),
+                        message: "the next port is for events, and there is none".to_owned(),
+                    })?;
+                Ok(Self::Tcp {
+                    host: host.clone(),
+                    port,
+                })
             }
         }
     }
 
     /// Refuses what a daemon must not listen at: anything beyond this machine.
     pub fn check_servable(&self) -> Result<(), EndpointError> {
-        let Self::Tcp { host, .. } = self else { return Ok(()) };
+        let Self::Tcp { host, .. } = self else {
+            return Ok(());
+        };
         let bare = host.trim_start_matches('[').trim_end_matches(']');
-        let loopback = host == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
-        if loopback { Ok(()) } else { Err(EndpointError::NotLoopback { uri: self.to_string() }) }
+        let loopback =
+            host == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
+        if loopback {
+            Ok(())
+        } else {
+            Err(EndpointError::NotLoopback {
+                uri: self.to_string(),
+            })
+        }
     }
 }
 
@@ -163,7 +204,9 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .write(true)
         .open(&lock_path)
         .map_err(io(&lock_path))?;
-    let in_use = || EndpointError::InUse { path: path.display().to_string() };
+    let in_use = || EndpointError::InUse {
+        path: path.display().to_string(),
+    };
     rustix::fs::flock(&lock, rustix::fs::FlockOperation::NonBlockingLockExclusive)
         .map_err(|_| in_use())?;
     match fs::symlink_metadata(path) {
@@ -172,7 +215,9 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         Ok(metadata) => {
             use std::os::unix::fs::FileTypeExt;
             if !metadata.file_type().is_socket() {
-                return Err(EndpointError::NotASocket { path: path.display().to_string() });
+                return Err(EndpointError::NotASocket {
+                    path: path.display().to_string(),
+                });
             }
             // Somebody who does not take the lock may listen there.
             if std::os::unix::net::UnixStream::connect(path).is_ok() {
@@ -187,13 +232,29 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
 /// Creates `directory` for its owner alone, or checks that no other user can put files there.
 fn private_directory(directory: &Path) -> Result<(), EndpointError> {
     let name = || directory.display().to_string();
-    match fs::DirBuilder::new().mode(0o700).recursive(true).create(directory) {
+    match fs::DirBuilder::new()
+        .mode(0o700)
+        .recursive(true)
+        .create(directory)
+    {
         Ok(()) => {}
-        Err(source) => return Err(EndpointError::Io { path: name(), source }),
+        Err(source) => {
+            return Err(EndpointError::Io {
+                path: name(),
+                source,
+            });
+        }
     }
-    let metadata =
-        fs::metadata(directory).map_err(|source| EndpointError::Io { path: name(), source })?;
-    let refuse = |message: String| Err(EndpointError::Directory { path: name(), message });
+    let metadata = fs::metadata(directory).map_err(|source| EndpointError::Io {
+        path: name(),
+        source,
+    })?;
+    let refuse = |message: String| {
+        Err(EndpointError::Directory {
+            path: name(),
+            message,
+        })
+    };
     let (uid, mode) = (rustix::process::getuid().as_raw(), metadata.mode() & 0o7777);
     let sticky = mode & 0o1000 != 0;
     if metadata.uid() != uid && !(metadata.uid() == 0 && (sticky || mode & 0o022 == 0)) {
@@ -201,12 +262,18 @@ fn private_directory(directory: &Path) -> Result<(), EndpointError> {
     }
     // The predictable name below /tmp could have been prepared by anybody.
     let well_known = directory.parent() == Some(Path::new("/tmp"))
-        && directory.file_name().is_some_and(|n| n.to_string_lossy().starts_with("coseg-"));
+        && directory
+            .file_name()
+            .is_some_and(|n| n.to_string_lossy().starts_with("coseg-"));
     if well_known && (mode & 0o077 != 0 || metadata.uid() != uid) {
-        return refuse(format!("has mode {mode:04o}, others may enter; expected 0700"));
+        return refuse(format!(
+            "has mode {mode:04o}, others may enter; expected 0700"
+        ));
     }
     if mode & 0o022 != 0 && !sticky {
-        return refuse(format!("has mode {mode:04o}, others may write; expected 0700"));
+        return refuse(format!(
+            "has mode {mode:04o}, others may write; expected 0700"
+        ));
     }
     Ok(())
 }
@@ -219,15 +286,37 @@ mod tests {
     #[test]
     fn uris_are_read_and_refused() {
         let ipc = Endpoint::parse("ipc:///run/x/coseg.sock").unwrap();
-        assert_eq!(ipc.events().unwrap().to_string(), "ipc:///run/x/coseg.sock.events");
+        assert_eq!(
+            ipc.events().unwrap().to_string(),
+            "ipc:///run/x/coseg.sock.events"
+        );
         let tcp = Endpoint::parse("tcp://127.0.0.1:7000").unwrap();
         assert_eq!(tcp.events().unwrap().to_string(), "tcp://127.0.0.1:7001");
-        for uri in ["udp://127.0.0.1:1", "inproc://x", "x", "", "pgm://eth0;239.0.0.1:1"] {
-            assert!(matches!(Endpoint::parse(uri), Err(EndpointError::Scheme { .. })), "{uri}");
+        for uri in [
+            "udp://127.0.0.1:1",
+            "inproc://x",
+            "x",
+            "",
+            "pgm://eth0;239.0.0.1:1",
+        ] {
+            assert!(
+                matches!(Endpoint::parse(uri), Err(EndpointError::Scheme { .. })),
+                "{uri}"
+            );
         }
-        for uri in ["ipc://", "ipc://*", "ipc://@x", "ipc:///tmp/", "tcp://h", "tcp://h:70000", "tcp://:1"]
-        {
-            assert!(matches!(Endpoint::parse(uri), Err(EndpointError::Malformed { .. })), "{uri}");
+        for uri in [
+            "ipc://",
+            "ipc://*",
+            "ipc://@x",
+            "ipc:///tmp/",
+            "tcp://h",
+            "tcp://h:70000",
+            "tcp://:1",
+        ] {
+            assert!(
+                matches!(Endpoint::parse(uri), Err(EndpointError::Malformed { .. })),
+                "{uri}"
+            );
         }
     }
 
@@ -236,17 +325,39 @@ mod tests {
         let fits = format!("ipc:///{}", "x".repeat(99));
         assert!(Endpoint::parse(&fits).is_ok());
         let error = Endpoint::parse(&format!("{fits}x")).unwrap_err();
-        assert!(error.to_string().ends_with("its socket path has 101 bytes, the limit is 100"), "{error}");
+        assert!(
+            error
+                .to_string()
+                .ends_with("its socket path has 101 bytes, the limit is 100"),
+            "{error}"
+        );
     }
 
     #[test]
     fn only_loopback_is_served() {
         for host in ["127.0.0.1", "127.8.8.8", "localhost", "[::1]"] {
-            Endpoint::parse(&format!("tcp://{host}:1")).unwrap().check_servable().unwrap();
+            Endpoint::parse(&format!("tcp://{host}:1"))
+                .unwrap()
+                .check_servable()
+                .unwrap();
         }
-        for host in ["0.0.0.0", "*", "10.0.0.1", "[::]", "eth0", "example.org", "localhost.example.org"] {
+        for host in [
+            "0.0.0.0",
+            "*",
+            "10.0.0.1",
+            "[::]",
+            "eth0",
+            "example.org",
+            "localhost.example.org",
+        ] {
             let endpoint = Endpoint::parse(&format!("tcp://{host}:1")).unwrap();
-            assert!(matches!(endpoint.check_servable(), Err(EndpointError::NotLoopback { .. })), "{host}");
+            assert!(
+                matches!(
+                    endpoint.check_servable(),
+                    Err(EndpointError::NotLoopback { .. })
+                ),
+                "{host}"
+            );
         }
     }
 
@@ -255,12 +366,21 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("sub/s.sock");
         let lock = claim_socket(&path).unwrap();
-        let mode = std::fs::metadata(path.parent().unwrap()).unwrap().permissions().mode();
+        let mode = std::fs::metadata(path.parent().unwrap())
+            .unwrap()
+            .permissions()
+            .mode();
         assert_eq!(mode & 0o777, 0o700);
-        assert!(matches!(claim_socket(&path), Err(EndpointError::InUse { .. })));
+        assert!(matches!(
+            claim_socket(&path),
+            Err(EndpointError::InUse { .. })
+        ));
         drop(lock);
         let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
-        assert!(matches!(claim_socket(&path), Err(EndpointError::InUse { .. })));
+        assert!(matches!(
+            claim_socket(&path),
+            Err(EndpointError::InUse { .. })
+        ));
         drop(listener);
         assert!(path.exists());
         let _lock = claim_socket(&path).unwrap();
@@ -277,6 +397,9 @@ mod tests {
         assert!(error.to_string().contains("has mode 0777"), "{error}");
         let file = directory.path().join("file");
         std::fs::write(&file, "x").unwrap();
-        assert!(matches!(claim_socket(&file), Err(EndpointError::NotASocket { .. })));
+        assert!(matches!(
+            claim_socket(&file),
+            Err(EndpointError::NotASocket { .. })
+        ));
     }
 }

@@ -22,21 +22,42 @@ pub struct FrameLimits {
 #[allow(missing_docs)]
 pub enum FrameError {
     #[error("the message has {found} {what}, the limit is {limit}")]
-    TooLarge { what: &'static str, found: u64, limit: u64 },
+    TooLarge {
+        what: &'static str,
+        found: u64,
+        limit: u64,
+    },
     #[error("the message has no header frame")]
     NoHeader,
     #[error("{field} is missing")]
     Missing { field: String },
     #[error("{field} names frame {frame}, but the message has {n_frames}")]
-    NoFrame { field: String, frame: u32, n_frames: usize },
+    NoFrame {
+        field: String,
+        frame: u32,
+        n_frames: usize,
+    },
     #[error("{field} has shape {shape:?} and needs {needed} bytes, but its frame has {found}")]
-    Length { field: String, shape: Vec<u64>, needed: u64, found: u64 },
+    Length {
+        field: String,
+        shape: Vec<u64>,
+        needed: u64,
+        found: u64,
+    },
     #[error("{field} has shape {shape:?}, which overflows")]
     Overflow { field: String, shape: Vec<u64> },
     #[error("{field} has element type {found}, expected {expected}")]
-    Type { field: String, found: i32, expected: &'static str },
+    Type {
+        field: String,
+        found: i32,
+        expected: &'static str,
+    },
     #[error("{field} has {found} axes, expected {expected}")]
-    Axes { field: String, found: usize, expected: usize },
+    Axes {
+        field: String,
+        found: usize,
+        expected: usize,
+    },
 }
 
 impl FrameError {
@@ -123,7 +144,14 @@ pub fn receive(
 pub fn send(socket: &zmq::Socket, parts: Vec<zmq::Message>, flags: i32) -> Result<(), zmq::Error> {
     let last = parts.len().saturating_sub(1);
     for (i, part) in parts.into_iter().enumerate() {
-        socket.send(part, if i < last { flags | zmq::SNDMORE } else { flags })?;
+        socket.send(
+            part,
+            if i < last {
+                flags | zmq::SNDMORE
+            } else {
+                flags
+            },
+        )?;
     }
     Ok(())
 }
@@ -156,12 +184,18 @@ impl FrameWriter {
 
     fn array(&mut self, dtype: DataType, shape: &[usize], bytes: Vec<u8>) -> ArrayRef {
         let shape = shape.iter().map(|&n| n as u64).collect();
-        ArrayRef { dtype: dtype.into(), shape, frame: self.push(bytes.into()) }
+        ArrayRef {
+            dtype: dtype.into(),
+            shape,
+            frame: self.push(bytes.into()),
+        }
     }
 
     /// Appends the bytes of a file.
     pub fn file(&mut self, bytes: impl Into<Bytes>) -> BytesRef {
-        BytesRef { frame: self.push(bytes.into()) }
+        BytesRef {
+            frame: self.push(bytes.into()),
+        }
     }
 
     fn push(&mut self, bytes: Bytes) -> u32 {
@@ -200,7 +234,13 @@ macro_rules! array_reader {
                 }
             }
             let (elements, _) = frame.as_chunks();
-            Ok((elements.iter().map(|e| <$element>::from_le_bytes(*e)).collect(), shape))
+            Ok((
+                elements
+                    .iter()
+                    .map(|e| <$element>::from_le_bytes(*e))
+                    .collect(),
+                shape,
+            ))
         }
     };
 }
@@ -216,7 +256,12 @@ impl<'a> FrameReader<'a> {
     array_reader!(f32_array, f32, DataType::Float32, "float32");
     array_reader!(f64_array, f64, DataType::Float64, "float64");
     // Indices: a negative one becomes larger than any count, so the range check finds it.
-    array_reader!(index_array, u32, DataType::Uint32 | DataType::Int32, "uint32 or int32");
+    array_reader!(
+        index_array,
+        u32,
+        DataType::Uint32 | DataType::Int32,
+        "uint32 or int32"
+    );
 
     /// Coordinates of either precision.
     pub fn coordinate_array(&self, array: Option<&ArrayRef>, field: &str) -> Elements<f64> {
@@ -231,16 +276,20 @@ impl<'a> FrameReader<'a> {
 
     /// The bytes of a file.
     pub fn file(&self, file: Option<&BytesRef>, field: &str) -> Result<&'a Bytes, FrameError> {
-        let file = file.ok_or_else(|| FrameError::Missing { field: field.to_owned() })?;
+        let file = file.ok_or_else(|| FrameError::Missing {
+            field: field.to_owned(),
+        })?;
         self.frame(file.frame, field)
     }
 
     fn frame(&self, frame: u32, field: &str) -> Result<&'a Bytes, FrameError> {
-        self.frames.get(frame as usize).ok_or_else(|| FrameError::NoFrame {
-            field: field.to_owned(),
-            frame,
-            n_frames: self.frames.len(),
-        })
+        self.frames
+            .get(frame as usize)
+            .ok_or_else(|| FrameError::NoFrame {
+                field: field.to_owned(),
+                frame,
+                n_frames: self.frames.len(),
+            })
     }
 
     fn array(
@@ -248,7 +297,9 @@ impl<'a> FrameReader<'a> {
         array: Option<&ArrayRef>,
         field: &str,
     ) -> Result<(DataType, Vec<usize>, &'a Bytes), FrameError> {
-        let array = array.ok_or_else(|| FrameError::Missing { field: field.to_owned() })?;
+        let array = array.ok_or_else(|| FrameError::Missing {
+            field: field.to_owned(),
+        })?;
         let frame = self.frame(array.frame, field)?;
         let element = match array.dtype() {
             DataType::Int32 | DataType::Uint32 | DataType::Float32 => 4_u64,
@@ -261,7 +312,10 @@ impl<'a> FrameReader<'a> {
                 });
             }
         };
-        let overflow = || FrameError::Overflow { field: field.to_owned(), shape: array.shape.clone() };
+        let overflow = || FrameError::Overflow {
+            field: field.to_owned(),
+            shape: array.shape.clone(),
+        };
         let needed = array
             .shape
             .iter()
@@ -275,7 +329,10 @@ impl<'a> FrameReader<'a> {
                 found: frame.len() as u64,
             });
         }
-        let shape = array.shape.iter().map(|&n| usize::try_from(n).map_err(|_| overflow()));
+        let shape = array
+            .shape
+            .iter()
+            .map(|&n| usize::try_from(n).map_err(|_| overflow()));
         Ok((array.dtype(), shape.collect::<Result<_, _>>()?, frame))
     }
 }
@@ -293,8 +350,14 @@ mod tests {
         let c = writer.file(vec![9_u8]);
         let frames = writer.finish();
         let reader = FrameReader::new(&frames);
-        assert_eq!(reader.f64_array(Some(&a), "a"), Ok((vec![1.5, -2.5], vec![2, 1])));
-        assert_eq!(reader.i32_array(Some(&b), "b"), Ok((vec![-1, 7, 8], vec![3])));
+        assert_eq!(
+            reader.f64_array(Some(&a), "a"),
+            Ok((vec![1.5, -2.5], vec![2, 1]))
+        );
+        assert_eq!(
+            reader.i32_array(Some(&b), "b"),
+            Ok((vec![-1, 7, 8], vec![3]))
+        );
         assert_eq!(reader.file(Some(&c), "c").unwrap().as_ref(), [9]);
         assert_eq!(frames[0].as_ref()[..8], 1.5_f64.to_le_bytes());
     }
@@ -310,34 +373,70 @@ mod tests {
         };
         let read = |a: &ArrayRef| reader.f32_array(Some(a), "x");
         assert!(read(&array(&[3], 0, DataType::Float32)).is_ok());
-        assert!(matches!(read(&array(&[4], 0, DataType::Float32)), Err(FrameError::Length { .. })));
+        assert!(matches!(
+            read(&array(&[4], 0, DataType::Float32)),
+            Err(FrameError::Length { .. })
+        ));
         assert!(matches!(
             read(&array(&[u64::MAX, u64::MAX], 0, DataType::Float32)),
             Err(FrameError::Overflow { .. })
         ));
-        assert!(matches!(read(&array(&[3], 1, DataType::Float32)), Err(FrameError::NoFrame { .. })));
-        assert!(matches!(read(&array(&[3], 0, DataType::Int32)), Err(FrameError::Type { .. })));
-        assert!(matches!(read(&array(&[3], 0, DataType::Unspecified)), Err(FrameError::Type { .. })));
-        assert!(matches!(reader.f32_array(None, "x"), Err(FrameError::Missing { .. })));
+        assert!(matches!(
+            read(&array(&[3], 1, DataType::Float32)),
+            Err(FrameError::NoFrame { .. })
+        ));
+        assert!(matches!(
+            read(&array(&[3], 0, DataType::Int32)),
+            Err(FrameError::Type { .. })
+        ));
+        assert!(matches!(
+            read(&array(&[3], 0, DataType::Unspecified)),
+            Err(FrameError::Type { .. })
+        ));
+        assert!(matches!(
+            reader.f32_array(None, "x"),
+            Err(FrameError::Missing { .. })
+        ));
     }
 
     #[test]
     fn messages_over_the_limit_are_dropped_and_the_next_one_arrives() {
         let context = zmq::Context::new();
-        let (a, b) = (context.socket(zmq::PAIR).unwrap(), context.socket(zmq::PAIR).unwrap());
+        let (a, b) = (
+            context.socket(zmq::PAIR).unwrap(),
+            context.socket(zmq::PAIR).unwrap(),
+        );
         a.bind("inproc://frames").unwrap();
         b.connect("inproc://frames").unwrap();
-        let limits = FrameLimits { max_message_bytes: 10, max_frames: 2, max_header_bytes: 10 };
+        let limits = FrameLimits {
+            max_message_bytes: 10,
+            max_frames: 2,
+            max_header_bytes: 10,
+        };
         let message = |sizes: &[usize]| {
-            send(&b, sizes.iter().map(|&n| zmq::Message::from(vec![1_u8; n])).collect(), 0).unwrap();
+            send(
+                &b,
+                sizes
+                    .iter()
+                    .map(|&n| zmq::Message::from(vec![1_u8; n]))
+                    .collect(),
+                0,
+            )
+            .unwrap();
             receive(&a, 0, &limits, 1).unwrap()
         };
         assert_eq!(message(&[4, 3, 3]).unwrap().len(), 3);
         let (kept, error) = message(&[4, 3, 4]).unwrap_err();
         assert_eq!((kept.len(), kept[0].len()), (1, 4));
-        assert_eq!(error.to_string(), "the message has 11 bytes, the limit is 10");
+        assert_eq!(
+            error.to_string(),
+            "the message has 11 bytes, the limit is 10"
+        );
         let (_, error) = message(&[1, 1, 1, 1]).unwrap_err();
-        assert_eq!(error.to_string(), "the message has 3 frames, the limit is 2");
+        assert_eq!(
+            error.to_string(),
+            "the message has 3 frames, the limit is 2"
+        );
         assert_eq!(message(&[1]).unwrap().len(), 1);
     }
 }

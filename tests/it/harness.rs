@@ -12,17 +12,22 @@ use std::time::Duration;
 use tempfile::TempDir;
 
 /// Long enough for a machine that is busy with other tests; only a failing test waits so long.
-pub const DEADLINE: Duration = Duration::from_secs(60);
+pub(crate) const DEADLINE: Duration = Duration::from_secs(60);
 
 /// The binary with nothing of this process's settings.
-pub fn coseg() -> Command {
+pub(crate) fn coseg() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_coseg"));
     for (name, _) in std::env::vars_os() {
         if name.to_string_lossy().starts_with("COSEG") {
             command.env_remove(name);
         }
     }
-    for name in ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "RUNTIME_DIRECTORY"] {
+    for name in [
+        "NOTIFY_SOCKET",
+        "WATCHDOG_USEC",
+        "WATCHDOG_PID",
+        "RUNTIME_DIRECTORY",
+    ] {
         command.env_remove(name);
     }
     command.env("NO_COLOR", "1");
@@ -30,25 +35,27 @@ pub fn coseg() -> Command {
 }
 
 /// A folder for a daemon: socket, library, notify socket.
-pub struct Home {
-    pub dir: TempDir,
+pub(crate) struct Home {
+    pub(crate) dir: TempDir,
 }
 
 impl Home {
-    pub fn new() -> Self {
-        Self { dir: tempfile::Builder::new().prefix("coseg").tempdir().unwrap() }
+    pub(crate) fn new() -> Self {
+        Self {
+            dir: tempfile::Builder::new().prefix("coseg").tempdir().unwrap(),
+        }
     }
 
-    pub fn path(&self, name: &str) -> PathBuf {
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.dir.path().join(name)
     }
 
-    pub fn endpoint(&self) -> String {
+    pub(crate) fn endpoint(&self) -> String {
         format!("ipc://{}", self.path("s").display())
     }
 
     /// A client command for this home's daemon.
-    pub fn coseg(&self, args: &[&str]) -> Output {
+    pub(crate) fn coseg(&self, args: &[&str]) -> Output {
         let mut command = coseg();
         command.args(args).env("COSEG_ENDPOINT", self.endpoint());
         // A test machine may be slow; what is tested with the default says so itself.
@@ -59,35 +66,41 @@ impl Home {
     }
 
     /// Writes a mesh file and returns its path.
-    pub fn mesh(&self, name: &str, text: &str) -> String {
+    pub(crate) fn mesh(&self, name: &str, text: &str) -> String {
         let path = self.path(name);
         std::fs::write(&path, text).unwrap();
         path.display().to_string()
     }
 
-    pub fn start(&self) -> Daemon {
+    pub(crate) fn start(&self) -> Daemon {
         self.start_with(&[], &[])
     }
 
     /// Starts a daemon and waits until it says that it is ready.
-    pub fn start_with(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
+    pub(crate) fn start_with(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
         let mut daemon = self.spawn(args, env);
         daemon.await_notice("READY=1");
         daemon
     }
 
     /// Starts a daemon that may refuse to start.
-    pub fn spawn(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
+    pub(crate) fn spawn(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
         let notify_path = self.path("notify");
         let _ = std::fs::remove_file(&notify_path);
         let notify = UnixDatagram::bind(&notify_path).unwrap();
         notify.set_read_timeout(Some(DEADLINE)).unwrap();
         let mut command = coseg();
-        command.arg("serve").arg("--library").arg(self.path("library"));
+        command
+            .arg("serve")
+            .arg("--library")
+            .arg(self.path("library"));
         if !args.contains(&"--endpoint") {
             command.args(["--endpoint", &self.endpoint()]);
         }
-        command.args(args).env("NOTIFY_SOCKET", &notify_path).envs(env.iter().copied());
+        command
+            .args(args)
+            .env("NOTIFY_SOCKET", &notify_path)
+            .envs(env.iter().copied());
         let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
         let (lines_in, lines) = mpsc::channel();
         let stderr = BufReader::new(child.stderr.take().unwrap());
@@ -98,27 +111,36 @@ impl Home {
                 }
             }
         });
-        Daemon { child, notify, lines, said: Vec::new(), endpoint: self.endpoint() }
+        Daemon {
+            child,
+            notify,
+            lines,
+            said: Vec::new(),
+            endpoint: self.endpoint(),
+        }
     }
 }
 
 /// A running daemon; killed when dropped.
-pub struct Daemon {
-    pub child: Child,
-    pub notify: UnixDatagram,
+pub(crate) struct Daemon {
+    pub(crate) child: Child,
+    pub(crate) notify: UnixDatagram,
     lines: mpsc::Receiver<String>,
     /// Lines of stderr so far.
-    pub said: Vec<String>,
-    pub endpoint: String,
+    pub(crate) said: Vec<String>,
+    pub(crate) endpoint: String,
 }
 
 impl Daemon {
     /// Waits for a message to the service manager that has this line.
-    pub fn await_notice(&mut self, line: &str) -> String {
+    pub(crate) fn await_notice(&mut self, line: &str) -> String {
         let mut buffer = [0_u8; 4096];
         loop {
             let n = self.notify.recv(&mut buffer).unwrap_or_else(|e| {
-                panic!("no {line:?} ({e}); stderr: {:#?}", self.lines.try_iter().collect::<Vec<_>>())
+                panic!(
+                    "no {line:?} ({e}); stderr: {:#?}",
+                    self.lines.try_iter().collect::<Vec<_>>()
+                )
             });
             let text = String::from_utf8(buffer[..n].to_vec()).unwrap();
             if text.lines().any(|l| l == line) {
@@ -128,7 +150,7 @@ impl Daemon {
     }
 
     /// Waits for a line of stderr that has this text.
-    pub fn await_line(&mut self, text: &str) -> String {
+    pub(crate) fn await_line(&mut self, text: &str) -> String {
         loop {
             let line = self.lines.recv_timeout(DEADLINE);
             let line = line.unwrap_or_else(|e| panic!("no {text:?} ({e}) after {:#?}", self.said));
@@ -139,17 +161,17 @@ impl Daemon {
         }
     }
 
-    pub fn client(&self) -> Client {
+    pub(crate) fn client(&self) -> Client {
         Client::connect(&self.endpoint, DEADLINE).unwrap()
     }
 
-    pub fn signal(&self, signal: Signal) {
+    pub(crate) fn signal(&self, signal: Signal) {
         let pid = Pid::from_child(&self.child);
         rustix::process::kill_process(pid, signal).unwrap();
     }
 
     /// Waits until the process has ended.
-    pub fn ended(mut self) -> (ExitStatus, Vec<String>) {
+    pub(crate) fn ended(mut self) -> (ExitStatus, Vec<String>) {
         let pid = Pid::from_child(&self.child);
         let (over_in, over) = mpsc::channel::<()>();
         let guard = std::thread::spawn(move || {
@@ -174,7 +196,7 @@ impl Drop for Daemon {
 }
 
 /// Sends a request and returns the code and reason of the refusal.
-pub fn refusal(client: &mut Client, body: request::Body) -> (ErrorCode, ErrorReason) {
+pub(crate) fn refusal(client: &mut Client, body: request::Body) -> (ErrorCode, ErrorReason) {
     match client.call(body, Vec::new()) {
         Err(coseg::ipc::client::ClientError::Refused(e)) => (e.code(), e.reason()),
         Ok((result, _)) => panic!("not refused: {result:?}"),
@@ -183,7 +205,7 @@ pub fn refusal(client: &mut Client, body: request::Body) -> (ErrorCode, ErrorRea
 }
 
 /// Adds shapes and waits for the finished job.
-pub fn add(client: &mut Client, collection: &str, shapes: &[(&str, &str)]) -> wire::Job {
+pub(crate) fn add(client: &mut Client, collection: &str, shapes: &[(&str, &str)]) -> wire::Job {
     let (body, frames) = add_request(collection, shapes, wire::AddMode::Wait);
     match client.call(body, frames).unwrap().0 {
         reply::Result::AddShapes(reply) => reply.job.unwrap(),
@@ -192,31 +214,39 @@ pub fn add(client: &mut Client, collection: &str, shapes: &[(&str, &str)]) -> wi
 }
 
 /// A request that adds OFF texts, creating the collection with two parts.
-pub fn add_request(
+pub(crate) fn add_request(
     collection: &str,
     shapes: &[(&str, &str)],
     mode: wire::AddMode,
 ) -> (request::Body, Vec<bytes::Bytes>) {
-    let inputs = shapes.iter().enumerate().map(|(i, (name, _))| wire::ShapeInput {
-        name: (*name).to_owned(),
-        replace: false,
-        source: Some(wire::shape_input::Source::Encoded(wire::EncodedMesh {
-            format: wire::MeshFormat::Off.into(),
-            bytes: Some(wire::BytesRef { frame: i as u32 }),
-        })),
-    });
+    let inputs = shapes
+        .iter()
+        .enumerate()
+        .map(|(i, (name, _))| wire::ShapeInput {
+            name: (*name).to_owned(),
+            replace: false,
+            source: Some(wire::shape_input::Source::Encoded(wire::EncodedMesh {
+                format: wire::MeshFormat::Off.into(),
+                bytes: Some(wire::BytesRef { frame: i as u32 }),
+            })),
+        });
     let request = wire::AddShapesRequest {
         collection: collection.to_owned(),
         shapes: inputs.collect(),
         mode: mode.into(),
-        create: Some(wire::CollectionSpec { n_parts: Some(2), ..Default::default() }),
+        create: Some(wire::CollectionSpec {
+            n_parts: Some(2),
+            ..Default::default()
+        }),
     };
-    let frames = shapes.iter().map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
+    let frames = shapes
+        .iter()
+        .map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
     (request::Body::AddShapes(request), frames.collect())
 }
 
 /// A closed surface of 2 × 16 × 23 triangles like a skittle: a body and a head, of varying proportions.
-pub fn skittle(variant: u32) -> String {
+pub(crate) fn skittle(variant: u32) -> String {
     let (rings, sectors) = (24_u32, 16_u32);
     let mut vertices = vec![[0.0, 0.0, -1.0]];
     let vary = f64::from(variant);
@@ -254,22 +284,22 @@ pub fn skittle(variant: u32) -> String {
 }
 
 /// Faces of a [`skittle`].
-pub const SKITTLE_FACES: usize = 2 * 16 * 23;
+pub(crate) const SKITTLE_FACES: usize = 2 * 16 * 23;
 
 /// Standard output as text; the command must have ended with `code`.
-pub fn stdout(output: &Output, code: i32) -> String {
+pub(crate) fn stdout(output: &Output, code: i32) -> String {
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(code), "stderr: {stderr}");
     String::from_utf8(output.stdout.clone()).unwrap()
 }
 
 /// Standard output as JSON; it must be nothing else.
-pub fn json(output: &Output, code: i32) -> serde_json::Value {
+pub(crate) fn json(output: &Output, code: i32) -> serde_json::Value {
     let text = stdout(output, code);
     serde_json::from_str(&text).unwrap_or_else(|e| panic!("{e}: {text}"))
 }
 
 /// Whether a path exists, for assertions that read well.
-pub fn exists(path: impl AsRef<Path>) -> bool {
+pub(crate) fn exists(path: impl AsRef<Path>) -> bool {
     path.as_ref().exists()
 }

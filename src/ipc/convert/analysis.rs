@@ -26,7 +26,9 @@ pub fn spectrum(
 /// The heat kernel signature.
 pub fn hks(d: &DescriptionView<'_>, frames: &mut FrameWriter) -> wire::GetHksReply {
     let n = d.vertices.len();
-    wire::GetHksReply { hks: Some(frames.f32_array(d.hks, &[n, d.hks.len() / n.max(1)])) }
+    wire::GetHksReply {
+        hks: Some(frames.f32_array(d.hks, &[n, d.hks.len() / n.max(1)])),
+    }
 }
 
 /// The proxy and what was computed on it.
@@ -70,11 +72,18 @@ pub fn part_correspondence(matches: &[PartMatch], q: &Quality) -> wire::GetPartC
         label_b: m.label_b,
         overlap: m.overlap,
     });
-    wire::GetPartCorrespondenceReply { matches: matches.collect(), quality: Some(quality(q)) }
+    wire::GetPartCorrespondenceReply {
+        matches: matches.collect(),
+        quality: Some(quality(q)),
+    }
 }
 
 /// Neighbours with their distances.
 pub fn nearest(neighbors: Vec<(String, f64)>) -> wire::NearestReply {
-    let neighbors = neighbors.into_iter().map(|(shape, distance)| wire::Neighbor { shape, distance });
-    wire::NearestReply { neighbors: neighbors.collect() }
+    let neighbors = neighbors
+        .into_iter()
+        .map(|(shape, distance)| wire::Neighbor { shape, distance });
+    wire::NearestReply {
+        neighbors: neighbors.collect(),
+    }
 }

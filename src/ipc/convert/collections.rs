@@ -27,7 +27,10 @@ fn operator_to_wire(operator: Operator) -> wire::Operator {
 }
 
 /// What to create; fields that are not given take their defaults.
-pub fn collection_spec(spec: &wire::CollectionSpec, field: &str) -> Result<CollectionSpec, wire::Error> {
+pub fn collection_spec(
+    spec: &wire::CollectionSpec,
+    field: &str,
+) -> Result<CollectionSpec, wire::Error> {
     let range = |name: &str, value: i32| {
         let field = format!("{field}.{name}");
         field_error(
@@ -69,12 +72,22 @@ pub fn collection_differs(
     is: &CollectionSpec,
 ) -> Option<(&'static str, String, String)> {
     let is = spec_to_wire(is);
-    let parts = |n: u32| if n == 0 { "estimated".to_owned() } else { n.to_string() };
+    let parts = |n: u32| {
+        if n == 0 {
+            "estimated".to_owned()
+        } else {
+            n.to_string()
+        }
+    };
     if let Some(n) = wish.n_parts.filter(|&n| n != is.n_parts()) {
         return Some(("n_parts", parts(n), parts(is.n_parts())));
     }
     if wish.up() != wire::Up::Unspecified && wish.up() != is.up() {
-        return Some(("up", up_name(wish.up()).to_owned(), up_name(is.up()).to_owned()));
+        return Some((
+            "up",
+            up_name(wish.up()).to_owned(),
+            up_name(is.up()).to_owned(),
+        ));
     }
     if wish.operator() != wire::Operator::Unspecified && wish.operator() != is.operator() {
         let name = |o: wire::Operator| operator_name(o).to_owned();
@@ -161,7 +174,11 @@ mod tests {
 
     #[test]
     fn only_stated_settings_are_compared() {
-        let is = CollectionSpec { n_parts: Some(3), up: Up::PlusY, ..CollectionSpec::default() };
+        let is = CollectionSpec {
+            n_parts: Some(3),
+            up: Up::PlusY,
+            ..CollectionSpec::default()
+        };
         let mut wish = wire::CollectionSpec::default();
         assert_eq!(collection_differs(&wish, &is), None);
         wish.n_parts = Some(3);
@@ -178,9 +195,15 @@ mod tests {
 
     #[test]
     fn unknown_enum_values_are_refused() {
-        let spec = wire::CollectionSpec { up: 99, ..wire::CollectionSpec::default() };
+        let spec = wire::CollectionSpec {
+            up: 99,
+            ..wire::CollectionSpec::default()
+        };
         let error = collection_spec(&spec, "spec").unwrap_err();
-        assert_eq!(error.message, "spec.up is 99, which this version does not know");
+        assert_eq!(
+            error.message,
+            "spec.up is 99, which this version does not know"
+        );
         assert_eq!(error.reason(), wire::ErrorReason::FieldRange);
     }
 }

@@ -81,9 +81,11 @@ fn store_error(e: &StoreError, message: String) -> Error {
             retry_after_ms: DISK_FULL_RETRY_MS,
             ..error(ErrorCode::ResourceExhausted, ErrorReason::NoSpace, message)
         },
-        StoreError::ReadOnly { .. } => {
-            error(ErrorCode::FailedPrecondition, ErrorReason::ReadOnly, message)
-        }
+        StoreError::ReadOnly { .. } => error(
+            ErrorCode::FailedPrecondition,
+            ErrorReason::ReadOnly,
+            message,
+        ),
         e if e.is_damage() => error(ErrorCode::DataLoss, ErrorReason::Damaged, message),
         _ => error(ErrorCode::Internal, ErrorReason::Store, message),
     }
@@ -92,7 +94,11 @@ fn store_error(e: &StoreError, message: String) -> Error {
 /// Why one shape of a job failed.
 pub fn failure(f: &Failure) -> Error {
     let code = ErrorCode::from_str_name(&format!("ERROR_CODE_{}", f.code));
-    let error = error(code.unwrap_or(ErrorCode::Internal), reason(&f.reason), f.message.clone());
+    let error = error(
+        code.unwrap_or(ErrorCode::Internal),
+        reason(&f.reason),
+        f.message.clone(),
+    );
     let subject = f.subject.map(|subject| match subject {
         FailureSubject::Face(i) => Subject::Face(i),
         FailureSubject::Vertex(i) => Subject::Vertex(i),
@@ -124,10 +130,19 @@ mod tests {
             reason: "BAD_NAME",
             message: "the name has 300 characters, the limit is 255".to_owned(),
         });
-        assert_eq!((e.code(), e.reason()), (ErrorCode::InvalidArgument, ErrorReason::BadName));
+        assert_eq!(
+            (e.code(), e.reason()),
+            (ErrorCode::InvalidArgument, ErrorReason::BadName)
+        );
         assert_eq!(e.message, "the name has 300 characters, the limit is 255");
-        let e = library_error(&LibraryError::NotFound { what: "shape", name: "x".to_owned() });
-        assert_eq!((e.code(), e.reason()), (ErrorCode::NotFound, ErrorReason::NoShape));
+        let e = library_error(&LibraryError::NotFound {
+            what: "shape",
+            name: "x".to_owned(),
+        });
+        assert_eq!(
+            (e.code(), e.reason()),
+            (ErrorCode::NotFound, ErrorReason::NoShape)
+        );
     }
 
     #[test]
@@ -138,7 +153,10 @@ mod tests {
             message: "vertex 3 is NaN".to_owned(),
             subject: Some(crate::library::FailureSubject::Vertex(3)),
         });
-        assert_eq!((e.code(), e.reason()), (ErrorCode::InvalidArgument, ErrorReason::NonFiniteVertex));
+        assert_eq!(
+            (e.code(), e.reason()),
+            (ErrorCode::InvalidArgument, ErrorReason::NonFiniteVertex)
+        );
         assert_eq!(e.subject, Some(super::Subject::Vertex(3)));
     }
 }

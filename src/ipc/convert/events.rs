@@ -8,20 +8,37 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
     let kind = match &e.kind {
         EventKind::CollectionCreated => Kind::CollectionCreated(wire::CollectionCreated {}),
         EventKind::CollectionDeleted => Kind::CollectionDeleted(wire::CollectionDeleted {}),
-        EventKind::ShapeAdded { shape, version, area_shares } => {
+        EventKind::ShapeAdded {
+            shape,
+            version,
+            area_shares,
+        } => {
             let area_shares = area_shares
                 .iter()
                 .map(|&(label, area_share)| wire::LabelShare { label, area_share })
                 .collect();
-            Kind::ShapeAdded(wire::ShapeAdded { shape: shape.clone(), version: *version, area_shares })
+            Kind::ShapeAdded(wire::ShapeAdded {
+                shape: shape.clone(),
+                version: *version,
+                area_shares,
+            })
         }
-        EventKind::ShapeRemoved { shape } => {
-            Kind::ShapeRemoved(wire::ShapeRemoved { shape: shape.clone() })
-        }
-        EventKind::LabelsChanged { shape, version, cause, moves } => {
+        EventKind::ShapeRemoved { shape } => Kind::ShapeRemoved(wire::ShapeRemoved {
+            shape: shape.clone(),
+        }),
+        EventKind::LabelsChanged {
+            shape,
+            version,
+            cause,
+            moves,
+        } => {
             let moves = moves
                 .iter()
-                .map(|m| wire::LabelMove { from: m.from, to: m.to, area_share: m.area_share })
+                .map(|m| wire::LabelMove {
+                    from: m.from,
+                    to: m.to,
+                    area_share: m.area_share,
+                })
                 .collect();
             Kind::LabelsChanged(wire::LabelsChanged {
                 shape: shape.clone(),
@@ -30,23 +47,34 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
                 moves,
             })
         }
-        EventKind::LabelCreated { label } => Kind::LabelCreated(wire::LabelCreated { label: *label }),
-        EventKind::LabelMerged { from, into } => {
-            Kind::LabelMerged(wire::LabelMerged { from: *from, into: *into })
+        EventKind::LabelCreated { label } => {
+            Kind::LabelCreated(wire::LabelCreated { label: *label })
         }
-        EventKind::LabelSplit { from, into } => {
-            Kind::LabelSplit(wire::LabelSplit { from: *from, into: into.clone() })
-        }
-        EventKind::LabelNamed { label, name } => {
-            Kind::LabelNamed(wire::LabelNamed { label: *label, name: name.clone() })
-        }
-        EventKind::Reclustered { score_before, score_after, accepted } => {
-            Kind::Reclustered(wire::Reclustered {
-                score_before: *score_before,
-                score_after: *score_after,
-                accepted: *accepted,
-            })
-        }
+        EventKind::LabelMerged { from, into } => Kind::LabelMerged(wire::LabelMerged {
+            from: *from,
+            into: *into,
+        }),
+        EventKind::LabelSplit { from, into } => Kind::LabelSplit(wire::LabelSplit {
+            from: *from,
+            into: into.clone(),
+        }),
+        EventKind::LabelNamed { label, name } => Kind::LabelNamed(wire::LabelNamed {
+            label: *label,
+            name: name.clone(),
+        }),
+        EventKind::Reclustered {
+            score_before,
+            score_after,
+            accepted,
+        } => Kind::Reclustered(wire::Reclustered {
+            score_before: *score_before,
+            score_after: *score_after,
+            accepted: *accepted,
+        }),
     };
-    wire::Event { sequence: e.sequence, collection: collection.to_owned(), kind: Some(kind) }
+    wire::Event {
+        sequence: e.sequence,
+        collection: collection.to_owned(),
+        kind: Some(kind),
+    }
 }

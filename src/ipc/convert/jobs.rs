@@ -35,14 +35,20 @@ pub fn new_shapes(
 ) -> Result<Vec<NewShape>, wire::Error> {
     let n = request.shapes.len();
     if n == 0 {
-        return Err(field_error(ErrorReason::FieldMissing, "shapes", "shapes is empty"));
+        return Err(field_error(
+            ErrorReason::FieldMissing,
+            "shapes",
+            "shapes is empty",
+        ));
     }
     if n > ingest.max_shapes {
         let message = format!("shapes has {n} entries, the limit is {}", ingest.max_shapes);
         return Err(field_error(ErrorReason::MessageTooLarge, "shapes", message));
     }
     let shapes = request.shapes.iter().enumerate();
-    shapes.map(|(i, shape)| new_shape(shape, &format!("shapes[{i}]"), frames, ingest)).collect()
+    shapes
+        .map(|(i, shape)| new_shape(shape, &format!("shapes[{i}]"), frames, ingest))
+        .collect()
 }
 
 fn new_shape(
@@ -53,13 +59,20 @@ fn new_shape(
 ) -> Result<NewShape, wire::Error> {
     let too_large = |found: u64| {
         let limit = ingest.max_shape_bytes;
-        let message = format!("{field} ({:?}) has {found} bytes, the limit is {limit}", shape.name);
+        let message = format!(
+            "{field} ({:?}) has {found} bytes, the limit is {limit}",
+            shape.name
+        );
         field_error(ErrorReason::MeshTooLarge, field, message)
     };
     let (bytes, format) = match &shape.source {
         None => {
             let message = format!("{field} ({:?}) has no mesh", shape.name);
-            return Err(field_error(ErrorReason::FieldMissing, &format!("{field}.source"), message));
+            return Err(field_error(
+                ErrorReason::FieldMissing,
+                &format!("{field}.source"),
+                message,
+            ));
         }
         Some(shape_input::Source::Encoded(mesh)) => {
             let format = match mesh.format() {
@@ -95,7 +108,12 @@ fn new_shape(
     if bytes.len() as u64 > ingest.max_shape_bytes {
         return Err(too_large(bytes.len() as u64));
     }
-    Ok(NewShape { name: shape.name.clone(), bytes, format, replace: shape.replace })
+    Ok(NewShape {
+        name: shape.name.clone(),
+        bytes,
+        format,
+        replace: shape.replace,
+    })
 }
 
 /// The OFF file that holds exactly these values: the shortest decimals that read back as the same bits.
@@ -105,17 +123,26 @@ fn off_from_arrays(
     frames: FrameReader<'_>,
 ) -> Result<Vec<u8>, wire::Error> {
     let range = |field: String, message: String| {
-        field_error(ErrorReason::FieldRange, &field, format!("{field} {message}"))
+        field_error(
+            ErrorReason::FieldRange,
+            &field,
+            format!("{field} {message}"),
+        )
     };
     let field_of = |name: &str| format!("{field}.{name}");
     let read = |e| frame_error(&e);
-    let (coordinates, shape) =
-        frames.coordinate_array(mesh.vertices.as_ref(), &field_of("vertices")).map_err(read)?;
+    let (coordinates, shape) = frames
+        .coordinate_array(mesh.vertices.as_ref(), &field_of("vertices"))
+        .map_err(read)?;
     let [n, 3] = shape[..] else {
-        return Err(range(field_of("vertices"), format!("has shape {shape:?}, expected (n, 3)")));
+        return Err(range(
+            field_of("vertices"),
+            format!("has shape {shape:?}, expected (n, 3)"),
+        ));
     };
-    let (faces, shape) =
-        frames.index_array(mesh.faces.as_ref(), &field_of("faces")).map_err(read)?;
+    let (faces, shape) = frames
+        .index_array(mesh.faces.as_ref(), &field_of("faces"))
+        .map_err(read)?;
     let (m, d) = match shape[..] {
         [m, d] if d >= 3 => (m, d),
         _ => {
@@ -131,7 +158,11 @@ fn off_from_arrays(
     for (i, face) in faces.chunks_exact(d).enumerate() {
         if let Some(v) = face.iter().find(|&&v| v as usize >= n) {
             let message = format!("face {i} names vertex {v}, but the mesh has {n}");
-            let e = error(ErrorCode::InvalidArgument, ErrorReason::VertexIndex, message);
+            let e = error(
+                ErrorCode::InvalidArgument,
+                ErrorReason::VertexIndex,
+                message,
+            );
             return Err(super::with_subject(e, Subject::Face(i as u64)));
         }
         let _ = write!(text, "{d}");
@@ -146,7 +177,11 @@ fn off_from_arrays(
 /// The answer to an accepted AddShapes.
 pub fn add_shapes(job_id: u64, n_shapes: usize, job: Option<wire::Job>) -> wire::AddShapesReply {
     let n_shapes = u32::try_from(n_shapes).expect("invariant: shapes per request are limited");
-    wire::AddShapesReply { job_id, n_shapes, job }
+    wire::AddShapesReply {
+        job_id,
+        n_shapes,
+        job,
+    }
 }
 
 /// Whether nothing of the item is left to do.
@@ -163,7 +198,10 @@ fn placed(p: &Placed) -> wire::Placed {
         Outcome::Unchanged => wire::Outcome::Unchanged,
         Outcome::Replaced => wire::Outcome::Replaced,
     };
-    let stages = p.stages_ms.iter().map(|(stage, ms)| wire::StageTime { stage: stage.clone(), ms: *ms });
+    let stages = p.stages_ms.iter().map(|(stage, ms)| wire::StageTime {
+        stage: stage.clone(),
+        ms: *ms,
+    });
     wire::Placed {
         outcome: outcome.into(),
         version: p.version,
@@ -176,7 +214,11 @@ fn placed(p: &Placed) -> wire::Placed {
 
 /// One shape of a job; `live_stage` is what it is at in this process, if it is at anything.
 pub fn item(i: &JobItem, live_stage: Option<&str>) -> wire::JobItem {
-    let mut wire = wire::JobItem { index: i.index, name: i.name.clone(), ..Default::default() };
+    let mut wire = wire::JobItem {
+        index: i.index,
+        name: i.name.clone(),
+        ..Default::default()
+    };
     let state = match (&i.state, live_stage) {
         (ItemState::Queued | ItemState::Running(_), Some(stage)) => {
             wire.stage = stage.to_owned();
@@ -211,10 +253,21 @@ mod tests {
         source: Option<Source>,
         frames: &[bytes::Bytes],
     ) -> Result<Vec<crate::library::NewShape>, wire::Error> {
-        let shape = wire::ShapeInput { name: "x".to_owned(), replace: false, source };
-        let request = wire::AddShapesRequest { shapes: vec![shape], ..Default::default() };
+        let shape = wire::ShapeInput {
+            name: "x".to_owned(),
+            replace: false,
+            source,
+        };
+        let request = wire::AddShapesRequest {
+            shapes: vec![shape],
+            ..Default::default()
+        };
         let read_path = |_: &std::path::Path| Ok(vec![0; 2_000]);
-        let ingest = Ingest { max_shapes: 1, max_shape_bytes: 1_000, read_path: &read_path };
+        let ingest = Ingest {
+            max_shapes: 1,
+            max_shape_bytes: 1_000,
+            read_path: &read_path,
+        };
         new_shapes(&request, FrameReader::new(frames), &ingest)
     }
 
@@ -223,13 +276,24 @@ mod tests {
         let mut writer = FrameWriter::default();
         let vertices = writer.f64_array(&[0.1, 0.0, 1e-300, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0], &[3, 3]);
         let faces = writer.i32_array(&[0, 1, 2], &[1, 3]);
-        let mesh = wire::ArrayMesh { vertices: Some(vertices), faces: Some(faces) };
+        let mesh = wire::ArrayMesh {
+            vertices: Some(vertices),
+            faces: Some(faces),
+        };
         let shapes = read(Some(Source::Arrays(mesh)), &writer.finish()).unwrap();
         let text = String::from_utf8(shapes[0].bytes.clone()).unwrap();
-        let first: Vec<f64> =
-            text.lines().nth(2).unwrap().split(' ').map(|x| x.parse().unwrap()).collect();
+        let first: Vec<f64> = text
+            .lines()
+            .nth(2)
+            .unwrap()
+            .split(' ')
+            .map(|x| x.parse().unwrap())
+            .collect();
         assert_eq!(first, [0.1, 0.0, 1e-300]);
-        assert!(text.starts_with("OFF\n3 1 0\n") && text.ends_with("\n3 0 1 2\n"), "{text}");
+        assert!(
+            text.starts_with("OFF\n3 1 0\n") && text.ends_with("\n3 0 1 2\n"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -237,7 +301,10 @@ mod tests {
         let mut writer = FrameWriter::default();
         let vertices = writer.f32_array(&[0.0; 9], &[3, 3]);
         let faces = writer.i32_array(&[0, 1, 2, 0, -1, 2], &[2, 3]);
-        let mesh = wire::ArrayMesh { vertices: Some(vertices), faces: Some(faces) };
+        let mesh = wire::ArrayMesh {
+            vertices: Some(vertices),
+            faces: Some(faces),
+        };
         let error = read(Some(Source::Arrays(mesh)), &writer.finish()).unwrap_err();
         assert_eq!(error.reason(), ErrorReason::VertexIndex);
         assert_eq!(error.subject, Some(Subject::Face(1)));
@@ -245,17 +312,36 @@ mod tests {
 
     #[test]
     fn missing_and_oversized_meshes_are_refused() {
-        assert_eq!(read(None, &[]).unwrap_err().reason(), ErrorReason::FieldMissing);
+        assert_eq!(
+            read(None, &[]).unwrap_err().reason(),
+            ErrorReason::FieldMissing
+        );
         let encoded = |format: wire::MeshFormat| {
             let bytes = Some(wire::BytesRef { frame: 0 });
-            Some(Source::Encoded(wire::EncodedMesh { format: format.into(), bytes }))
+            Some(Source::Encoded(wire::EncodedMesh {
+                format: format.into(),
+                bytes,
+            }))
         };
         let reason = |source, n: usize| {
-            read(source, &[bytes::Bytes::from(vec![0; n])]).unwrap_err().reason()
+            read(source, &[bytes::Bytes::from(vec![0; n])])
+                .unwrap_err()
+                .reason()
         };
-        assert_eq!(reason(encoded(wire::MeshFormat::Obj), 1_001), ErrorReason::MeshTooLarge);
-        assert_eq!(reason(encoded(wire::MeshFormat::Unspecified), 1), ErrorReason::FieldRange);
-        assert_eq!(read(encoded(wire::MeshFormat::Off), &[]).unwrap_err().reason(), ErrorReason::FrameMissing);
+        assert_eq!(
+            reason(encoded(wire::MeshFormat::Obj), 1_001),
+            ErrorReason::MeshTooLarge
+        );
+        assert_eq!(
+            reason(encoded(wire::MeshFormat::Unspecified), 1),
+            ErrorReason::FieldRange
+        );
+        assert_eq!(
+            read(encoded(wire::MeshFormat::Off), &[])
+                .unwrap_err()
+                .reason(),
+            ErrorReason::FrameMissing
+        );
         let path = |p: &str| Some(Source::Path(p.to_owned()));
         assert_eq!(reason(path("/a/b.off"), 0), ErrorReason::MeshTooLarge);
         assert_eq!(reason(path("/a/b.step"), 0), ErrorReason::FieldRange);

@@ -9,7 +9,9 @@ mod shapes;
 
 pub use analysis::{descriptors, functional_map, hks, nearest, part_correspondence, spectrum};
 pub use collections::{collection, collection_differs, collection_spec, label_info};
-pub use errors::{error, failure, field_error, frame_error, library_error, library_failure, with_subject};
+pub use errors::{
+    error, failure, field_error, frame_error, library_error, library_failure, with_subject,
+};
 pub use events::event;
 pub use jobs::{Ingest, add_shapes, item, job_finished, mesh_format, new_shapes};
 pub use shapes::{labels, labels_snapshot, original, shape};

@@ -71,10 +71,20 @@ pub fn labels_snapshot(
         version: l.version,
         labels: Some(frames.i32_array(&l.labels, &[l.labels.len()])),
     });
-    wire::LabelsSnapshotReply { sequence, shapes: shapes.collect() }
+    wire::LabelsSnapshotReply {
+        sequence,
+        shapes: shapes.collect(),
+    }
 }
 
 /// The bytes of a shape as they were sent.
-pub fn original(bytes: Vec<u8>, format: Format, frames: &mut FrameWriter) -> wire::GetOriginalReply {
-    wire::GetOriginalReply { format: mesh_format(format).into(), bytes: Some(frames.file(bytes)) }
+pub fn original(
+    bytes: Vec<u8>,
+    format: Format,
+    frames: &mut FrameWriter,
+) -> wire::GetOriginalReply {
+    wire::GetOriginalReply {
+        format: mesh_format(format).into(),
+        bytes: Some(frames.file(bytes)),
+    }
 }
