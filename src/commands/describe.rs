@@ -48,7 +48,10 @@ pub(crate) struct Describe {
 
 /// Milliseconds by stage, in the order of the stages.
 #[derive(Default)]
-struct Laps(RefCell<(Vec<(String, f64)>, Option<Instant>)>);
+struct Laps(RefCell<Running>);
+
+/// The laps so far, and since when the last one runs.
+type Running = (Vec<(String, f64)>, Option<Instant>);
 
 impl Laps {
     /// Ends the stage before and begins this one.

@@ -219,7 +219,8 @@ impl Parts {
             column_weights.extend(std::iter::repeat_n(g / (*width as f64).sqrt(), *width));
         }
         let n_shape = PartGraph::N_SHAPE;
-        let blocks: [(fn(&PartGraph) -> &[f64], Vec<f64>); 4] = [
+        type Block = (fn(&PartGraph) -> &[f64], Vec<f64>);
+        let blocks: [Block; 4] = [
             (|g| &g.mean, column_weights.clone()),
             (
                 |g| &g.spread,

@@ -94,8 +94,9 @@ pub fn merge_patches(
             continue;
         }
         let sum = area[i] + area[j];
-        for c in 0..dim {
-            mean[i][c] = (area[i] * mean[i][c] + area[j] * mean[j][c]) / sum.max(1e-300);
+        let merged = std::mem::take(&mut mean[j]);
+        for (m, other) in mean[i].iter_mut().zip(&merged) {
+            *m = (area[i] * *m + area[j] * other) / sum.max(1e-300);
         }
         area[i] = sum;
         version[i] += 1;
@@ -270,8 +271,8 @@ impl PartGraph {
 fn extents(surface: &Surface, part_of_face: &[u32], area: &[f64]) -> Vec<[f64; 3]> {
     let mut centre = vec![[0.0; 3]; area.len()];
     for (f, &p) in part_of_face.iter().enumerate() {
-        for c in 0..3 {
-            centre[p as usize][c] += surface.area[f] * surface.centroids[f][c];
+        for (sum, x) in centre[p as usize].iter_mut().zip(surface.centroids[f]) {
+            *sum += surface.area[f] * x;
         }
     }
     for (c, a) in centre.iter_mut().zip(area) {
