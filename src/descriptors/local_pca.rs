@@ -107,7 +107,9 @@ fn describe(geometry: &FaceGeometry, f: usize, near: &[([f64; 3], f64)], row: &m
     for &(p, area) in near {
         let d = [p[0] - center[0], p[1] - center[1], p[2] - center[2]];
         let square = dot(d, d);
-        if let Some(shell) = squares.iter().position(|&s| square <= s) {
+        if square <= squares[2] {
+            // Adding up comparisons is quicker than branching on them.
+            let shell = usize::from(square > squares[0]) + usize::from(square > squares[1]);
             shells[shell].add(d, area);
         }
     }
@@ -116,7 +118,11 @@ fn describe(geometry: &FaceGeometry, f: usize, near: &[([f64; 3], f64)], row: &m
         ball.join(shell);
         let (e, axes) = principal(ball.covariance());
         // A face alone in its ball has no axis.
-        let axis = if e[0] > MIN_VARIANCE { axes[0] } else { [0.0; 3] };
+        let axis = if e[0] > MIN_VARIANCE {
+            axes[0]
+        } else {
+            [0.0; 3]
+        };
         columns.copy_from_slice(&[
             (e[0] - e[1]) / e[0],
             (e[1] - e[2]) / e[0],

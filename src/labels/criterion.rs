@@ -1,9 +1,10 @@
 //! How good a labelling of patches is, without any ground truth.
 //!
-//! Good labels have boundaries along concave creases and join what is alike or touches:
-//! `½ ln(concavity) + ln(association)`. Concavity is the length-weighted mean crease on label boundaries over
-//! that on all patch boundaries; association the mean over labels of the affinity within the label over all
-//! its affinity, in the joint patch graph.
+//! Good labels have boundaries along concave creases and join what is alike or touches, more than chance would:
+//! `½ ln(concavity) + ln(modularity)`. Concavity is the length-weighted mean crease on label boundaries over that
+//! on all patch boundaries; modularity the share of affinity within labels above its expectation (Newman and
+//! Girvan 2004), in the joint patch graph. Modularity rather than the plain share within labels, because the
+//! latter rewards one label that swallows most of every shape, and cannot compare different numbers of labels.
 
 use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
@@ -76,34 +77,22 @@ impl Criterion {
         sums
     }
 
-    /// The score of a labelling, from its pair sums; higher is better.
+    /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
     pub(super) fn score(&self, sums: &PairSums) -> f64 {
-        let (concavity, association, _) = self.terms(sums);
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + association.max(1e-6).ln()
-    }
-
-    /// A score that labellings with different numbers of labels can be compared by: the association above
-    /// what chance would give (Newman and Girvan's modularity) in the place of the plain one.
-    pub(super) fn score_over_k(&self, sums: &PairSums) -> f64 {
-        let (concavity, _, modularity) = self.terms(sums);
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
-    }
-
-    fn terms(&self, sums: &PairSums) -> (f64, f64, f64) {
         let k = sums.k;
         let off_diagonal = |m: &[f64]| -> f64 {
             m.iter().sum::<f64>() - (0..k).map(|l| m[l * k + l]).sum::<f64>()
         };
-        let concavity =
-            off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9) / self.mean_crease.max(1e-300);
-        let volume = |l: usize| sums.affinity[l * k..(l + 1) * k].iter().sum::<f64>();
-        let total: f64 = (0..k).map(volume).sum();
-        let within = |l: usize| sums.affinity[l * k + l];
-        let association = (0..k).map(|l| within(l) / volume(l).max(1e-9)).sum::<f64>() / k as f64;
-        let modularity = (0..k)
-            .map(|l| within(l) / total.max(1e-300) - (volume(l) / total.max(1e-300)).powi(2))
-            .sum::<f64>();
-        (concavity, association, modularity)
+        let boundary = off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9);
+        let concavity = boundary / self.mean_crease.max(1e-300);
+        let total: f64 = sums.affinity.iter().sum::<f64>().max(1e-300);
+        let modularity: f64 = (0..k)
+            .map(|l| {
+                let volume: f64 = sums.affinity[l * k..(l + 1) * k].iter().sum();
+                sums.affinity[l * k + l] / total - (volume / total).powi(2)
+            })
+            .sum();
+        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
     }
 }
 

@@ -149,7 +149,7 @@ pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Disco
     let chosen = range
         .filter_map(|k| {
             let labels = choose(&shapes, &criterion, k, options.seed)?;
-            Some((criterion.score_over_k(&criterion.pair_sums(&labels, k)), k, labels))
+            Some((criterion.score(&criterion.pair_sums(&labels, k)), k, labels))
         })
         .reduce(|best, next| if next.0 > best.0 { next } else { best });
     let Some((_, k, of_patch)) = chosen else {
@@ -168,7 +168,7 @@ pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Disco
 }
 
 /// The score of a face labelling with labels below `k`, as [`discover`] would judge it; comparable between
-/// labellings of the same shapes with the same number of labels.
+/// labellings of the same shapes.
 pub fn labelling_score(input: &DiscoveryInput<'_>, labels: &[Vec<u32>], k: usize) -> f64 {
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();

@@ -13,7 +13,7 @@ pub const ALGORITHM_VERSION: u32 = 1;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
-pub const MAX_EIGENVECTORS: usize = 100;
+const MAX_EIGENVECTORS: usize = 100;
 /// Eigenpairs on meshes so small that a quarter of their vertices is fewer.
 const MIN_EIGENPAIRS: usize = 4;
 /// Patches of the over-segmentation.
