@@ -107,7 +107,7 @@ pub(crate) enum Command {
     Describe(Describe),
     /// Make a family of labelled shapes
     Synth(SynthArgs),
-    /// Verify a library's files against its catalog, without a daemon
+    /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
     /// Check or show the daemon's configuration
     #[command(subcommand)]
@@ -455,9 +455,8 @@ mod tests {
     #[test]
     fn axes_are_read_with_their_sign() {
         for axis in ["+y", "-z", "unknown", "auto"] {
-            for line in [vec!["coseg", "add", "x.off", "--up", axis]] {
-                assert!(Cli::try_parse_from(line).is_ok(), "{axis}");
-            }
+            let line = ["coseg", "add", "x.off", "--up", axis];
+            assert!(Cli::try_parse_from(line).is_ok(), "{axis}");
         }
         assert!(Cli::try_parse_from(["coseg", "add", "x.off", "--up", "w"]).is_err());
         assert!(Cli::try_parse_from(["coseg", "ls", "--timeout", "0"]).is_err());

@@ -1,4 +1,7 @@
 //! All integration tests in one binary: linking dominates on two cores.
+// Clippy sees tests, not what they share.
+#![allow(clippy::unwrap_used)]
+
 mod cli;
 mod daemon;
 mod harness;
