@@ -1,4 +1,4 @@
-//! `coseg check`: a library's files against its catalog, without a daemon.
+//! `coseg check`: a library's files against its catalog.
 
 use super::Outcome;
 use super::session::print_line;

@@ -121,7 +121,7 @@ async fn change_in_order(
         });
         let done = done.await;
         match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-            Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((result, Vec::new()))),
+            Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((*result, Vec::new()))),
             Ok(writes::Done::WhenPlaced(job)) => {
                 let daemon = Arc::clone(&daemon);
                 tokio::spawn(async move {

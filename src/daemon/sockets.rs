@@ -398,9 +398,12 @@ impl SocketThread {
 
 impl Drop for Bound {
     fn drop(&mut self) {
-        // The locks outlive the sockets, whose files ZeroMQ removes when it unbinds.
-        let _ = self.router.unbind(&self.endpoint.to_string());
-        let _ = self.publisher.unbind(&self.events.to_string());
+        // ZeroMQ leaves the files; while the locks are held they are this daemon's.
+        for endpoint in [&self.endpoint, &self.events] {
+            if let Endpoint::Ipc(path) = endpoint {
+                let _ = std::fs::remove_file(path);
+            }
+        }
         self.locks.clear();
     }
 }

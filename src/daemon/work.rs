@@ -27,7 +27,7 @@ type Outcome = Result<Described, Failure>;
 #[allow(clippy::large_enum_variant)] // one at a time for each worker, never in a collection
 enum Prepared {
     /// It was described, or failed to be.
-    Described(Outcome),
+    Described(Box<Outcome>),
     /// When its turn to be described came, no description was needed: the same bytes were there under its
     /// name, or others that it may not replace. Looked at again when its turn to be placed comes.
     NotNeeded,
@@ -217,17 +217,16 @@ async fn hand_out(daemon: &Arc<Daemon>) {
             let mut memory = memory;
             let prepared = prepare(&daemon, &waiting.item);
             drop(worker);
-            match &prepared {
-                Prepared::Described(Ok(d)) => memory.shrink_to(bytes_of(&d.description)),
-                Prepared::NotNeeded => memory.shrink_to(0),
-                Prepared::Described(Err(_)) => {
-                    memory.shrink_to(0);
+            let kept = match &prepared {
+                Prepared::NotNeeded => 0,
+                Prepared::Described(outcome) => match outcome.as_ref() {
+                    Ok(d) => bytes_of(&d.description),
                     // Stopped, it seems: it is described again at the next start.
-                    if daemon.is_draining() {
-                        return;
-                    }
-                }
-            }
+                    Err(_) if daemon.is_draining() => return,
+                    Err(_) => 0,
+                },
+            };
+            memory.shrink_to(kept);
             // The lane is gone only if the daemon drains.
             let _ = sender.send((prepared, memory));
         });
@@ -237,8 +236,8 @@ async fn hand_out(daemon: &Arc<Daemon>) {
 fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
     match daemon.library.needs_description(item) {
         Ok(false) => Prepared::NotNeeded,
-        Ok(true) => Prepared::Described(describe(daemon, item)),
-        Err(e) => Prepared::Described(Err(convert::library_failure(&e))),
+        Ok(true) => Prepared::Described(Box::new(describe(daemon, item))),
+        Err(e) => Prepared::Described(Box::new(Err(convert::library_failure(&e)))),
     }
 }
 
@@ -356,12 +355,12 @@ async fn place_in_order(
 /// What is to be placed, now that all before it are. `None`: the daemon drains.
 async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
     if let Prepared::Described(outcome) = prepared {
-        return Some(outcome);
+        return Some(*outcome);
     }
     let subject = item.clone();
     // A shape before it may have removed the reason why no description was needed.
     let settled = blocking(daemon, move |d| match prepare(d, &subject) {
-        Prepared::Described(outcome) => outcome,
+        Prepared::Described(outcome) => *outcome,
         // The library sees by itself why, before it looks at this.
         Prepared::NotNeeded => Err(failed(
             "INTERNAL",

@@ -23,7 +23,7 @@ const QUEUE_RETRY_MS: u64 = 1_000;
 #[allow(clippy::large_enum_variant)] // returned once, never in a collection
 pub(crate) enum Done {
     /// With this.
-    Now(Reply),
+    Now(Box<Reply>),
     /// With this job, once it is finished.
     WhenPlaced(u64),
 }
@@ -44,7 +44,7 @@ pub(crate) fn change(
     key: Option<&RequestKey>,
 ) -> Result<Done, wire::Error> {
     if let Body::Drain(_) = body {
-        return drain(daemon).map(Done::Now);
+        return drain(daemon).map(|reply| Done::Now(Box::new(reply)));
     }
     if daemon.is_draining() {
         return Err(draining());
@@ -105,7 +105,7 @@ pub(crate) fn change(
         Body::AddShapes(r) => return add_shapes(daemon, r, frames, key),
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
     };
-    Ok(Done::Now(reply))
+    Ok(Done::Now(Box::new(reply)))
 }
 
 fn refuse(e: LibraryError) -> wire::Error {
@@ -165,9 +165,10 @@ fn add_shapes(
     daemon.take_up(&job, &n_bytes);
     match request.mode() {
         wire::AddMode::Wait => Ok(Done::WhenPlaced(job.id)),
-        wire::AddMode::Job | wire::AddMode::Unspecified => Ok(Done::Now(Reply::AddShapes(
-            convert::add_shapes(job.id, job.items.len(), None),
-        ))),
+        wire::AddMode::Job | wire::AddMode::Unspecified => {
+            let reply = convert::add_shapes(job.id, job.items.len(), None);
+            Ok(Done::Now(Box::new(Reply::AddShapes(reply))))
+        }
     }
 }
 

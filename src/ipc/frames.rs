@@ -87,17 +87,17 @@ impl FrameError {
     }
 }
 
-/// A received frame that owns ZeroMQ's memory, so that it need not be copied.
-struct Received(zmq::Message);
+/// A message's frames; or, if it was too large, its first frames and why it was dropped.
+pub type Received = Result<Vec<Bytes>, (Vec<Bytes>, FrameError)>;
 
-impl AsRef<[u8]> for Received {
+/// A received frame that owns ZeroMQ's memory, so that it need not be copied.
+struct OwnedFrame(zmq::Message);
+
+impl AsRef<[u8]> for OwnedFrame {
     fn as_ref(&self) -> &[u8] {
         &self.0
     }
 }
-
-/// The frames of a message, or its first frames and why the rest was dropped.
-pub type WholeMessage = Result<Vec<Bytes>, (Vec<Bytes>, FrameError)>;
 
 /// Receives all frames of one message. The outer error is the socket's; the inner one says that the
 /// message was too large and was dropped, with its first frames (at most `n_kept`) for an answer.
@@ -106,7 +106,7 @@ pub fn receive(
     flags: i32,
     limits: &FrameLimits,
     n_kept: usize,
-) -> Result<WholeMessage, zmq::Error> {
+) -> Result<Received, zmq::Error> {
     let mut frames = Vec::new();
     let mut excess = None;
     let (mut n_frames, mut n_bytes) = (0_usize, 0_u64);
@@ -131,7 +131,7 @@ pub fn receive(
             });
         }
         if excess.is_none() || frames.len() < n_kept {
-            frames.push(Bytes::from_owner(Received(part)));
+            frames.push(Bytes::from_owner(OwnedFrame(part)));
         }
         if let Some(error) = excess.take_if(|_| !more) {
             frames.truncate(n_kept);

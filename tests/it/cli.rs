@@ -402,19 +402,16 @@ fn collections_must_be_named_when_there_are_several() {
 }
 
 #[test]
-fn a_library_is_checked_without_a_daemon() {
+fn a_library_is_checked_with_and_without_a_daemon() {
     let home = Home::new();
     let mesh = home.mesh("m.off", &skittle(0));
     let daemon = home.start();
     stdout(&home.coseg(&["add", &mesh]), 0);
     let library = home.path("library").display().to_string();
-    let held = home.coseg(&["check", "--library", &library]);
-    assert_eq!(held.status.code(), Some(1));
-    assert!(
-        stderr(&held).contains("is held by another process"),
-        "{}",
-        stderr(&held)
-    );
+    let beside = json(&home.coseg(&["check", "--library", &library, "--json"]), 0);
+    assert_eq!(beside["ok"], true);
+    let nowhere = home.coseg(&["check", "--library", &format!("{library}/none")]);
+    assert_eq!(nowhere.status.code(), Some(1), "{}", stderr(&nowhere));
     stdout(&home.coseg(&["stop"]), 0);
     assert_eq!(daemon.ended().0.code(), Some(0));
     let good = json(&home.coseg(&["check", "--library", &library, "--json"]), 0);

@@ -1,5 +1,6 @@
 //! All integration tests in one binary: linking dominates on two cores.
-#![allow(clippy::unwrap_used)] // a test says by panicking what is wrong
+// Clippy sees tests, not what they share.
+#![allow(clippy::unwrap_used)]
 
 mod cli;
 mod daemon;

@@ -1,0 +1,370 @@
+//! Shapes come in: labelled, refused, cancelled, repeated.
+
+use super::{add_again, create, describe, events_since, raw, raw_error, wait_idle};
+use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, refusal, skittle};
+use coseg::call;
+use coseg::ipc::client::ClientError;
+use coseg::ipc::frames::FrameReader;
+use coseg::ipc::wire::{
+    self, ErrorCode, ErrorReason, ItemState, Outcome, Request, error::Subject, event::Kind, reply,
+    request,
+};
+use prost::Message as _;
+use rustix::process::Signal;
+
+#[test]
+fn shapes_are_labelled_in_the_order_of_their_faces() {
+    let home = Home::new();
+    let daemon = home.start();
+    let client = &mut daemon.client();
+    let text = skittle(0);
+    let job = add(client, "c", &[("a", &text), ("b", &skittle(1))]);
+    assert!(
+        job.finished && job.items.iter().all(|i| i.state() == ItemState::Done),
+        "{job:?}"
+    );
+    wait_idle(client, "c");
+    let (collection, shape) = ("c".to_owned(), "a".to_owned());
+    let request = wire::GetLabelsRequest {
+        collection,
+        shape,
+        version: 0,
+        confidence: true,
+    };
+    let (labels, frames) = call!(client, GetLabels(request), frames).unwrap();
+    let reader = FrameReader::new(&frames);
+    let (values, extents) = reader.i32_array(labels.labels.as_ref(), "labels").unwrap();
+    assert_eq!(extents, [SKITTLE_FACES]);
+    assert!(values.iter().all(|&l| l >= 0));
+    let (confidence, _) = reader
+        .f32_array(labels.confidence.as_ref(), "confidence")
+        .unwrap();
+    assert!(confidence.iter().all(|c| (0.0..=1.0).contains(c)));
+
+    let (collection, shape) = ("c".to_owned(), "a".to_owned());
+    let request = wire::GetOriginalRequest { collection, shape };
+    let (original, frames) = call!(client, GetOriginal(request), frames).unwrap();
+    let bytes = FrameReader::new(&frames)
+        .file(original.bytes.as_ref(), "bytes")
+        .unwrap();
+    assert_eq!(bytes.as_ref(), text.as_bytes());
+
+    let (collection, shape) = ("c".to_owned(), "a".to_owned());
+    let request = wire::GetSpectrumRequest {
+        collection,
+        shape,
+        eigenvectors: true,
+    };
+    let (spectrum, frames) = call!(client, GetSpectrum(request), frames).unwrap();
+    let reader = FrameReader::new(&frames);
+    let (values, _) = reader
+        .f64_array(spectrum.eigenvalues.as_ref(), "eigenvalues")
+        .unwrap();
+    assert!(values.is_sorted() && values[0].abs() < 1e-6 && values[1] > 0.0);
+    let (_, extents) = reader
+        .f32_array(spectrum.eigenvectors.as_ref(), "vectors")
+        .unwrap();
+    let (mass, _) = reader.f32_array(spectrum.mass.as_ref(), "mass").unwrap();
+    assert_eq!(extents[0], mass.len());
+    assert!((mass.iter().sum::<f32>() - 1.0).abs() < 1e-3);
+    assert!(spectrum.area > 1.0);
+
+    let request = wire::ListShapesRequest {
+        collection: "c".to_owned(),
+        page_size: 1,
+        ..Default::default()
+    };
+    let page = call!(client, ListShapes(request.clone())).unwrap();
+    assert_eq!(page.shapes[0].name, "a");
+    let page_token = page.next_page_token;
+    let page = call!(
+        client,
+        ListShapes(wire::ListShapesRequest {
+            page_token,
+            ..request
+        })
+    )
+    .unwrap();
+    assert_eq!(
+        (page.shapes[0].name.as_str(), page.next_page_token.as_str()),
+        ("b", "")
+    );
+}
+
+#[test]
+fn arrays_are_added_like_files() {
+    let home = Home::new();
+    let daemon = home.start();
+    let client = &mut daemon.client();
+    create(client, "c");
+    let text = skittle(0);
+    let numbers = |line: &str| {
+        line.split(' ')
+            .map(|x| x.parse::<f64>().unwrap())
+            .collect::<Vec<_>>()
+    };
+    let n = 2 + 16 * 23;
+    let lines: Vec<_> = text.lines().skip(2).map(numbers).collect();
+    let vertices: Vec<f64> = lines[..n].concat();
+    let faces: Vec<u32> = lines[n..]
+        .iter()
+        .flat_map(|l| l[1..].iter().map(|&v| v as u32))
+        .collect();
+    let mut frames = coseg::ipc::frames::FrameWriter::default();
+    let mesh = wire::ArrayMesh {
+        vertices: Some(frames.f64_array(&vertices, &[n, 3])),
+        faces: Some(frames.u32_array(&faces, &[SKITTLE_FACES, 3])),
+    };
+    let shape = wire::ShapeInput {
+        name: "arrays".to_owned(),
+        replace: false,
+        source: Some(wire::shape_input::Source::Arrays(mesh)),
+    };
+    let request = wire::AddShapesRequest {
+        collection: "c".to_owned(),
+        shapes: vec![shape],
+        mode: wire::AddMode::Wait.into(),
+        create: None,
+    };
+    let (reply, _) = call!(client, AddShapes(request), frames.finish(), with_frames).unwrap();
+    assert_eq!(reply.job.unwrap().items[0].state(), ItemState::Done);
+    // The same mesh as a file of the same digits is the same shape.
+    let job = add_again(client, "c", "arrays", &text);
+    assert_eq!(
+        job.items[0].placed.as_ref().unwrap().outcome(),
+        Outcome::Unchanged
+    );
+}
+
+#[test]
+fn refused_meshes_fail_alone_and_say_where() {
+    let home = Home::new();
+    let daemon = home.start();
+    let client = &mut daemon.client();
+    let bad_index = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n";
+    let shapes = [
+        ("good", skittle(0)),
+        ("bad", bad_index.to_owned()),
+        ("junk", "hello".to_owned()),
+    ];
+    let shapes: Vec<(&str, &str)> = shapes.iter().map(|(n, t)| (*n, t.as_str())).collect();
+    let job = add(client, "c", &shapes);
+    assert_eq!(job.items[0].state(), ItemState::Done);
+    let error = job.items[1].error.clone().unwrap();
+    assert_eq!(
+        (error.code(), error.reason()),
+        (ErrorCode::InvalidArgument, ErrorReason::VertexIndex)
+    );
+    assert_eq!(error.subject, Some(Subject::Face(0)));
+    assert_eq!(
+        job.items[2].error.as_ref().unwrap().reason(),
+        ErrorReason::Parse
+    );
+    // The same bytes again are unchanged, others under the name are not taken.
+    let again = add_again(client, "c", "good", &skittle(0));
+    assert_eq!(
+        again.items[0].placed.as_ref().unwrap().outcome(),
+        Outcome::Unchanged
+    );
+    let other = add_again(client, "c", "good", &skittle(1));
+    let error = other.items[0].error.as_ref().unwrap();
+    assert_eq!(
+        (error.code(), error.reason()),
+        (ErrorCode::AlreadyExists, ErrorReason::NameTaken)
+    );
+}
+
+#[test]
+fn the_same_request_again_has_one_effect_and_the_same_reply_across_a_restart() {
+    let home = Home::new();
+    let text = skittle(0);
+    let send = |daemon: &Daemon| {
+        let mut client = daemon.client();
+        client.set_client_id("importer");
+        let (body, frames) = add_request("c", &[("a", &text)], wire::AddMode::Job);
+        match client.call_as("17", body, frames).unwrap().0 {
+            reply::Result::AddShapes(reply) => reply,
+            other => panic!("unexpected: {other:?}"),
+        }
+    };
+    let daemon = home.start();
+    let replies = [send(&daemon), send(&daemon)];
+    wait_idle(&mut daemon.client(), "c");
+    daemon.signal(Signal::KILL);
+    drop(daemon.ended());
+    let daemon = home.start();
+    let last = send(&daemon);
+    assert!(replies.iter().all(|r| *r == last), "{replies:?}, {last:?}");
+    let client = &mut daemon.client();
+    wait_idle(client, "c");
+    let added = events_since(client, "c");
+    let added = added
+        .iter()
+        .filter(|e| matches!(e.kind, Some(Kind::ShapeAdded(_))))
+        .count();
+    assert_eq!(added, 1);
+    // The same id for another request is refused, not answered with the wrong reply.
+    client.set_client_id("importer");
+    let (body, frames) = add_request("c", &[("b", &text)], wire::AddMode::Job);
+    match client.call_as("17", body, frames) {
+        Err(ClientError::Refused(e)) => assert_eq!(e.reason(), ErrorReason::RequestIdReused),
+        other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
+    }
+}
+
+#[test]
+fn settings_that_differ_are_refused() {
+    let home = Home::new();
+    let daemon = home.start();
+    let client = &mut daemon.client();
+    add(client, "c", &[("a", &skittle(0))]);
+    let (body, frames) = add_request("c", &[("b", &skittle(1))], wire::AddMode::Wait);
+    let request::Body::AddShapes(mut request) = body else {
+        unreachable!()
+    };
+    request.create = Some(wire::CollectionSpec {
+        n_parts: Some(3),
+        ..Default::default()
+    });
+    match call!(client, AddShapes(request), frames, with_frames) {
+        Err(ClientError::Refused(e)) => {
+            assert_eq!(e.reason(), ErrorReason::CollectionDiffers);
+            assert_eq!(e.message, "collection \"c\" has n_parts 2, not 3");
+        }
+        other => panic!("unexpected: {other:?}"),
+    }
+}
+
+#[test]
+fn a_deadline_ends_the_wait_and_not_the_work() {
+    let home = Home::new();
+    let daemon = home.start();
+    let (body, frames) = add_request("c", &[("a", &skittle(0))], wire::AddMode::Wait);
+    let request = Request {
+        request_id: "1".to_owned(),
+        deadline_ms: 1,
+        body: Some(body),
+        ..Default::default()
+    };
+    let dealer = raw(zmq::DEALER, &home.endpoint());
+    let error = raw_error(&dealer, &[&request.encode_to_vec(), &frames[0]]);
+    assert_eq!(
+        (error.code(), error.reason()),
+        (ErrorCode::DeadlineExceeded, ErrorReason::Deadline)
+    );
+    let client = &mut daemon.client();
+    let Some(Subject::JobId(job_id)) = error.subject else {
+        // It was late before it was begun: then it has no effect.
+        assert_eq!(refusal(client, describe("c")).1, ErrorReason::NoCollection);
+        return;
+    };
+    wait_idle(client, "c");
+    let job = call!(client, GetJob(wire::GetJobRequest { job_id }))
+        .unwrap()
+        .job
+        .unwrap();
+    assert_eq!(job.items[0].state(), ItemState::Done);
+}
+
+#[test]
+fn a_cancelled_job_ends_and_the_next_is_done() {
+    let home = Home::new();
+    let daemon = home.start_with(&["--workers", "1"], &[]);
+    let client = &mut daemon.client();
+    let texts: Vec<_> = (0..12).map(|i| (format!("s{i}"), skittle(i))).collect();
+    let shapes: Vec<_> = texts
+        .iter()
+        .map(|(n, t)| (n.as_str(), t.as_str()))
+        .collect();
+    let (body, frames) = add_request("c", &shapes, wire::AddMode::Job);
+    let reply::Result::AddShapes(accepted) = client.call(body, frames).unwrap().0 else {
+        panic!("not accepted")
+    };
+    let job_id = accepted.job_id;
+    call!(client, CancelJob(wire::CancelJobRequest { job_id })).unwrap();
+    let job = loop {
+        let request = wire::WatchJobRequest {
+            job_id,
+            revision: 0,
+            wait_ms: 1_000,
+        };
+        let job = call!(client, WatchJob(request)).unwrap().job.unwrap();
+        if job.finished {
+            break job;
+        }
+    };
+    let n = |state| job.items.iter().filter(|i| i.state() == state).count();
+    assert!(n(ItemState::Cancelled) > 0, "{job:?}");
+    assert_eq!(n(ItemState::Cancelled) + n(ItemState::Done), 12);
+    let later = add(client, "c", &[("later", &skittle(20))]);
+    assert_eq!(later.items[0].state(), ItemState::Done);
+}
+
+#[test]
+fn a_full_queue_is_said_with_a_delay() {
+    let home = Home::new();
+    let daemon = home.start_with(&[], &[("COSEG__LIMITS__MAX_QUEUED_SHAPES", "1")]);
+    let client = &mut daemon.client();
+    let text = skittle(0);
+    let (body, frames) = add_request("c", &[("a", &text), ("b", &text)], wire::AddMode::Job);
+    match client.call(body, frames) {
+        Err(ClientError::Refused(e)) => {
+            assert_eq!(e.code(), ErrorCode::ResourceExhausted);
+            assert_eq!(e.reason(), ErrorReason::QueueFull);
+            assert!(e.retry_after_ms > 0);
+            assert_eq!(
+                e.message,
+                "0 shapes are queued and 2 more asked for, the limit is 1"
+            );
+        }
+        other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
+    }
+    assert_eq!(
+        add(client, "c", &[("a", &text)]).items[0].state(),
+        ItemState::Done
+    );
+}
+
+#[test]
+fn paths_are_read_only_where_the_configuration_allows() {
+    let home = Home::new();
+    let allowed = home.path("allowed");
+    std::fs::create_dir(&allowed).unwrap();
+    std::fs::write(allowed.join("in.off"), skittle(0)).unwrap();
+    let outside = home.mesh("out.off", &skittle(0));
+    std::os::unix::fs::symlink(&outside, allowed.join("link.off")).unwrap();
+    let roots = allowed.display().to_string();
+    let daemon = home.start_with(&[], &[("COSEG__INGEST__PATHS", &roots)]);
+    let client = &mut daemon.client();
+    create(client, "c");
+    let mut by_path = |path: String| {
+        let shape = wire::ShapeInput {
+            name: "a".to_owned(),
+            replace: false,
+            source: Some(wire::shape_input::Source::Path(path)),
+        };
+        let request = wire::AddShapesRequest {
+            collection: "c".to_owned(),
+            shapes: vec![shape],
+            mode: wire::AddMode::Wait.into(),
+            create: None,
+        };
+        call!(client, AddShapes(request))
+    };
+    for forbidden in [
+        outside,
+        format!("{roots}/../out.off"),
+        format!("{roots}/link.off"),
+        format!("{roots}/missing.off"),
+        "in.off".to_owned(),
+    ] {
+        match by_path(forbidden.clone()) {
+            Err(ClientError::Refused(e)) => {
+                assert_eq!(e.reason(), ErrorReason::PathForbidden, "{forbidden}");
+            }
+            other => panic!("{forbidden}: {other:?}"),
+        }
+    }
+    let job = by_path(format!("{roots}/in.off")).unwrap().job.unwrap();
+    assert_eq!(job.items[0].state(), ItemState::Done);
+}
