@@ -5,25 +5,28 @@
 //! number of known shapes and labels its faces (pure, serial per collection). [`Library`] commits the
 //! result: the one effect. The daemon is a shell around [`Library`].
 
+// In the order in which data flows: a module names only modules before it (tests/it/tidy.rs).
+
 // Pure: values in, values out.
 pub mod linalg;
 pub mod mesh;
 pub mod operators;
 pub mod spectrum;
+pub mod description;
 pub mod descriptors;
 pub mod segmentation;
-pub mod neighbors;
 pub mod fmap;
 pub mod correspondence;
 pub mod labels;
+pub mod neighbors;
 pub mod pipeline;
 pub mod synth;
 
 // Shell: files, sockets, clocks.
 pub mod store;
 pub mod library;
-pub mod config;
 pub mod ipc;
+pub mod config;
 pub mod daemon;
 
 pub use library::Library;

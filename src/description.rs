@@ -21,7 +21,13 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { operator: Operator::default(), working_faces: 2_500, n_eigenpairs: 300, only_meaningful: true, threads: 1 }
+        Self {
+            operator: Operator::default(),
+            working_faces: 2_500,
+            n_eigenpairs: 300,
+            only_meaningful: true,
+            threads: 1,
+        }
     }
 }
 
