@@ -155,7 +155,7 @@ impl fmt::Display for ByteSize {
         let unit = UNITS[..4]
             .iter()
             .rev()
-            .find(|(_, unit)| self.0 > 0 && self.0 % unit == 0);
+            .find(|(_, unit)| self.0 > 0 && self.0.is_multiple_of(*unit));
         match unit {
             Some((name, unit)) => write!(f, "{}{name}", self.0 / unit),
             None => write!(f, "{}", self.0),

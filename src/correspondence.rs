@@ -37,7 +37,11 @@ pub fn parts(surface: &Surface, labels: &[u32]) -> Parts {
         area[*r as usize] += surface.area[f];
     }
     let mut order: Vec<u32> = (0..m as u32).filter(|f| roots[*f as usize] == *f).collect();
-    order.sort_by(|&a, &b| area[b as usize].total_cmp(&area[a as usize]).then(a.cmp(&b)));
+    order.sort_by(|&a, &b| {
+        area[b as usize]
+            .total_cmp(&area[a as usize])
+            .then(a.cmp(&b))
+    });
     let mut number = vec![0u32; m];
     for (i, r) in order.iter().enumerate() {
         number[*r as usize] = i as u32;
@@ -50,7 +54,12 @@ pub fn parts(surface: &Surface, labels: &[u32]) -> Parts {
 }
 
 /// Part of each vertex: that of most of the area around it; ties go to the larger part.
-pub fn part_of_vertex(parts: &Parts, n_vertices: usize, faces: &[[u32; 3]], area: &[f64]) -> Vec<u32> {
+pub fn part_of_vertex(
+    parts: &Parts,
+    n_vertices: usize,
+    faces: &[[u32; 3]],
+    area: &[f64],
+) -> Vec<u32> {
     let mut around: Vec<Vec<(u32, f64)>> = vec![Vec::new(); n_vertices];
     for (f, face) in faces.iter().enumerate() {
         let part = parts.part_of_face[f];
@@ -63,7 +72,9 @@ pub fn part_of_vertex(parts: &Parts, n_vertices: usize, faces: &[[u32; 3]], area
         }
     }
     let most = |list: Vec<(u32, f64)>| {
-        list.into_iter().max_by(|x, y| x.1.total_cmp(&y.1).then(y.0.cmp(&x.0))).map_or(0, |x| x.0)
+        list.into_iter()
+            .max_by(|x, y| x.1.total_cmp(&y.1).then(y.0.cmp(&x.0)))
+            .map_or(0, |x| x.0)
     };
     around.into_iter().map(most).collect()
 }
@@ -71,7 +82,12 @@ pub fn part_of_vertex(parts: &Parts, n_vertices: usize, faces: &[[u32; 3]], area
 /// Intersection over union, by mass on shape B, of every part of B with every part of A carried over by
 /// `p2p (n_b,)`: for each vertex of B a vertex of A. Only pairs that overlap: (part of A, part of B, overlap),
 /// by descending overlap.
-pub fn overlaps(part_of_a: &[u32], part_of_b: &[u32], p2p: &[u32], mass_b: &[f32]) -> Vec<(u32, u32, f64)> {
+pub fn overlaps(
+    part_of_a: &[u32],
+    part_of_b: &[u32],
+    p2p: &[u32],
+    mass_b: &[f32],
+) -> Vec<(u32, u32, f64)> {
     let n_a = part_of_a.iter().max().map_or(0, |p| *p as usize + 1);
     let n_b = part_of_b.iter().max().map_or(0, |p| *p as usize + 1);
     let mut joint = vec![0.0; n_a * n_b];
@@ -103,7 +119,12 @@ mod tests {
 
     #[test]
     fn parts_are_connected_pieces_largest_first() {
-        let edge = |a, b| SurfaceEdge { faces: [a, b], length: 1.0, crease: 0.0, boundary_cost: 1.0 };
+        let edge = |a, b| SurfaceEdge {
+            faces: [a, b],
+            length: 1.0,
+            crease: 0.0,
+            boundary_cost: 1.0,
+        };
         let surface = Surface {
             area: vec![0.1, 0.1, 0.5, 0.3],
             centroids: vec![[0.0; 3]; 4],

@@ -30,3 +30,8 @@ pub mod config;
 pub mod daemon;
 
 pub use library::Library;
+
+/// Runs the example of the README as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -43,8 +43,10 @@ impl SignatureMetric {
         known: impl Iterator<Item = &'a [f32]>,
         limit: usize,
     ) -> Vec<(usize, f64)> {
-        let mut ranked: Vec<(usize, f64)> =
-            known.enumerate().map(|(i, s)| (i, self.distance(signature, s))).collect();
+        let mut ranked: Vec<(usize, f64)> = known
+            .enumerate()
+            .map(|(i, s)| (i, self.distance(signature, s)))
+            .collect();
         ranked.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
         ranked.truncate(limit);
         ranked

@@ -48,7 +48,10 @@ pub(crate) struct Describe {
 
 /// Milliseconds by stage, in the order of the stages.
 #[derive(Default)]
-struct Laps(RefCell<(Vec<(String, f64)>, Option<Instant>)>);
+struct Laps(RefCell<Running>);
+
+/// The laps so far, and since when the last one runs.
+type Running = (Vec<(String, f64)>, Option<Instant>);
 
 impl Laps {
     /// Ends the stage before and begins this one.
@@ -88,9 +91,14 @@ struct Summary {
 
 pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
     let path = args.mesh.display().to_string();
-    let file = |source| CommandError::File { path: path.clone(), source };
+    let file = |source| CommandError::File {
+        path: path.clone(),
+        source,
+    };
     let Some(format) = Format::from_name(&path) else {
-        return Err(CommandError::Usage(format!("{path}: the extension is none of .obj .off")));
+        return Err(CommandError::Usage(format!(
+            "{path}: the extension is none of .obj .off"
+        )));
     };
     let bytes = fs::read(&args.mesh).map_err(file)?;
     let defaults = Params::default();
@@ -101,7 +109,9 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
         only_meaningful: args.k.is_none(),
         threads: args.threads,
     };
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads as usize).build();
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads as usize)
+        .build();
     let pool = pool.map_err(|e| CommandError::Failed(format!("cannot start threads: {e}")))?;
     let (summary, arrays, laps) = pool.install(|| {
         let laps = Laps::default();
@@ -114,7 +124,10 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
         Ok::<_, CommandError>((summary, arrays, laps.finish()))
     })?;
     if let Some(out) = &args.out {
-        let source = |source| CommandError::File { path: out.display().to_string(), source };
+        let source = |source| CommandError::File {
+            path: out.display().to_string(),
+            source,
+        };
         fs::write(out, arrays).map_err(source)?;
     }
     print(args, global, &summary, &laps)?;
@@ -161,16 +174,32 @@ fn full(
     let values = &found.spectrum.eigenvalues;
     let arrays = if write {
         laps.enter("hks");
-        let hks = hks(values, &found.spectrum.eigenvectors, &hks_times(values, N_HKS_TIMES));
+        let hks = hks(
+            values,
+            &found.spectrum.eigenvectors,
+            &hks_times(values, N_HKS_TIMES),
+        );
         laps.enter("write");
         let vectors = found.spectrum.eigenvectors.transpose();
         let hks: Vec<f64> = hks.into_iter().map(f64::from).collect();
-        full_arrays(&cleaned.mesh, &cleaned.face_of_polygon, &found.mass, values, vectors.as_slice(), &hks)?
+        full_arrays(
+            &cleaned.mesh,
+            &cleaned.face_of_polygon,
+            &found.mass,
+            values,
+            vectors.as_slice(),
+            &hks,
+        )?
     } else {
         Vec::new()
     };
     let least = values.iter().copied().find(|v| *v > 0.0).unwrap_or(1.0);
-    let relative = found.spectrum.residuals.iter().zip(values).map(|(r, v)| r / v.max(least));
+    let relative = found
+        .spectrum
+        .residuals
+        .iter()
+        .zip(values)
+        .map(|(r, v)| r / v.max(least));
     let summary = Summary {
         area: cleaned.area,
         n_vertices: cleaned.mesh.vertices.len(),
@@ -194,13 +223,33 @@ fn full_arrays(
     let doubles = |x: &[f64]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let words = |x: &[u32]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let arrays = [
-        ("vertices", Dtype::F64, vec![n, 3], doubles(mesh.vertices.as_flattened())),
-        ("faces", Dtype::U32, vec![mesh.faces.len(), 3], words(mesh.faces.as_flattened())),
+        (
+            "vertices",
+            Dtype::F64,
+            vec![n, 3],
+            doubles(mesh.vertices.as_flattened()),
+        ),
+        (
+            "faces",
+            Dtype::U32,
+            vec![mesh.faces.len(), 3],
+            words(mesh.faces.as_flattened()),
+        ),
         ("mass", Dtype::F64, vec![n], doubles(mass)),
         ("eigenvalues", Dtype::F64, vec![k], doubles(eigenvalues)),
-        ("eigenvectors", Dtype::F64, vec![n, k], doubles(eigenvectors)),
+        (
+            "eigenvectors",
+            Dtype::F64,
+            vec![n, k],
+            doubles(eigenvectors),
+        ),
         ("hks", Dtype::F64, vec![n, N_HKS_TIMES], doubles(hks)),
-        ("face_map", Dtype::U32, vec![face_map.len()], words(face_map)),
+        (
+            "face_map",
+            Dtype::U32,
+            vec![face_map.len()],
+            words(face_map),
+        ),
     ];
     let mut views = Vec::new();
     for (name, dtype, shape, bytes) in &arrays {
@@ -226,8 +275,10 @@ fn print(
     laps: &[(String, f64)],
 ) -> Result<(), CommandError> {
     if global.json {
-        let timings: serde_json::Map<String, Value> =
-            laps.iter().map(|(name, ms)| (name.clone(), json!(ms))).collect();
+        let timings: serde_json::Map<String, Value> = laps
+            .iter()
+            .map(|(name, ms)| (name.clone(), json!(ms)))
+            .collect();
         let mut value = json!({
             "mesh": args.mesh.display().to_string(),
             "operator": crate::cli::Operator::name(args.operator.to_domain()),

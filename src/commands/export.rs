@@ -1,6 +1,6 @@
 //! `coseg export`: labels, or coloured meshes, of a collection become files.
 
-use super::export_mesh::{materials, obj, ply, polygons};
+use super::export_mesh::{colour, material, materials, polygons};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
@@ -8,6 +8,7 @@ use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
+use coseg::mesh::write::{mtl, obj, ply};
 use coseg::mesh::{Format, ParsedMesh, parse};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -20,7 +21,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
     }
-    let colours = session.describe(&collection)?.labels;
+    let infos = session.describe(&collection)?.labels;
     let shapes = match args.shapes.as_slice() {
         [] => session
             .shapes(&collection, None)?
@@ -54,25 +55,21 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             }
             ExportFormat::Ply => {
                 let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let text = ply(&mesh.vertices, &polygons(&mesh), &labels, &colours);
-                write(format!("{shape}.ply"), text.as_bytes())?;
+                let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, &infos)).collect();
+                let bytes = ply(&mesh.vertices, &polygons(&mesh), &colours, &labels);
+                write(format!("{shape}.ply"), &bytes)?;
             }
             ExportFormat::Obj => {
                 let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let text = obj(
-                    &mesh.vertices,
-                    &polygons(&mesh),
-                    &labels,
-                    &colours,
-                    MATERIALS,
-                );
+                let name = |label| material(label, &infos);
+                let text = obj(&mesh.vertices, &polygons(&mesh), &labels, name, MATERIALS);
                 write(format!("{shape}.obj"), text.as_bytes())?;
             }
         }
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        write(MATERIALS.to_owned(), materials(&colours).as_bytes())?;
+        write(MATERIALS.to_owned(), mtl(&materials(&infos)).as_bytes())?;
     }
     progress.finish_and_clear();
     if session.json {

@@ -1,8 +1,7 @@
-//! Meshes with labels become PLY and OBJ text, faces in the order of the input.
+//! What exported meshes show of labels: polygons of the input, colours, names of materials.
 
 use coseg::ipc::wire::LabelInfo;
 use coseg::mesh::ParsedMesh;
-use std::fmt::Write as _;
 
 /// Colour of faces without a label.
 const UNLABELLED: [u8; 3] = [128, 128, 128];
@@ -21,7 +20,8 @@ pub(crate) fn polygons(mesh: &ParsedMesh) -> Vec<Vec<u32>> {
     polygons
 }
 
-fn colour(label: i32, labels: &[LabelInfo]) -> [u8; 3] {
+/// The colour of a label; grey without one.
+pub(crate) fn colour(label: i32, labels: &[LabelInfo]) -> [u8; 3] {
     let found = u32::try_from(label)
         .ok()
         .and_then(|id| labels.iter().find(|l| l.id == id));
@@ -32,7 +32,7 @@ fn colour(label: i32, labels: &[LabelInfo]) -> [u8; 3] {
 }
 
 /// The name of a group and material: the label's id, with the name a person gave.
-fn material(label: i32, labels: &[LabelInfo]) -> String {
+pub(crate) fn material(label: i32, labels: &[LabelInfo]) -> String {
     let found = u32::try_from(label)
         .ok()
         .and_then(|id| labels.iter().find(|l| l.id == id));
@@ -44,91 +44,19 @@ fn material(label: i32, labels: &[LabelInfo]) -> String {
     }
 }
 
-/// ASCII PLY with a colour and `int label` for each face.
-pub(crate) fn ply(
-    vertices: &[[f64; 3]],
-    polygons: &[Vec<u32>],
-    labels: &[i32],
-    infos: &[LabelInfo],
-) -> String {
-    let most = polygons.iter().map(Vec::len).max().unwrap_or(0);
-    let count = if most <= usize::from(u8::MAX) {
-        "uchar"
-    } else {
-        "uint"
-    };
-    let mut text = format!(
-        "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\n\
-         property double z\nelement face {}\nproperty list {count} int vertex_indices\n\
-         property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int label\n\
-         end_header\n",
-        vertices.len(),
-        polygons.len()
-    );
-    // Writing to a string cannot fail.
-    for [x, y, z] in vertices {
-        let _ = writeln!(text, "{x} {y} {z}");
-    }
-    for (polygon, &label) in polygons.iter().zip(labels) {
-        let _ = write!(text, "{}", polygon.len());
-        for v in polygon {
-            let _ = write!(text, " {v}");
-        }
-        let [r, g, b] = colour(label, infos);
-        let _ = writeln!(text, " {r} {g} {b} {label}");
-    }
-    text
-}
-
-/// OBJ with `g` and `usemtl` wherever the label changes.
-pub(crate) fn obj(
-    vertices: &[[f64; 3]],
-    polygons: &[Vec<u32>],
-    labels: &[i32],
-    infos: &[LabelInfo],
-    materials: &str,
-) -> String {
-    let mut text = format!("mtllib {materials}\n");
-    for [x, y, z] in vertices {
-        let _ = writeln!(text, "v {x} {y} {z}");
-    }
-    let mut current = None;
-    for (polygon, &label) in polygons.iter().zip(labels) {
-        if current != Some(label) {
-            let name = material(label, infos);
-            let _ = writeln!(text, "g {name}\nusemtl {name}");
-            current = Some(label);
-        }
-        text.push('f');
-        for v in polygon {
-            let _ = write!(text, " {}", v + 1);
-        }
-        text.push('\n');
-    }
-    text
-}
-
-/// The material file of all labels.
-pub(crate) fn materials(infos: &[LabelInfo]) -> String {
-    let mut text = String::new();
+/// Names and colours of the materials of all labels, and of what has none.
+pub(crate) fn materials(infos: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
     let ids = infos
         .iter()
         .filter_map(|l| i32::try_from(l.id).ok())
         .chain([-1]);
-    for id in ids {
-        let [r, g, b] = colour(id, infos).map(|c| f64::from(c) / 255.0);
-        let _ = writeln!(
-            text,
-            "newmtl {}\nKd {r:.4} {g:.4} {b:.4}",
-            material(id, infos)
-        );
-    }
-    text
+    ids.map(|id| (material(id, infos), colour(id, infos)))
+        .collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{LabelInfo, materials, obj, ply, polygons};
+    use super::{LabelInfo, material, materials, polygons};
     use coseg::mesh::ParsedMesh;
 
     fn quad_and_triangle() -> ParsedMesh {
@@ -165,32 +93,13 @@ mod tests {
     }
 
     #[test]
-    fn ply_has_a_colour_and_a_label_for_each_face() {
-        let mesh = quad_and_triangle();
-        let text = ply(&mesh.vertices, &polygons(&mesh), &[7, -1], &infos());
-        assert!(text.contains("element face 2\nproperty list uchar int vertex_indices\n"));
-        assert!(
-            text.ends_with("4 0 1 2 3 1 2 255 7\n3 1 4 2 128 128 128 -1\n"),
-            "{text}"
-        );
-    }
-
-    #[test]
-    fn obj_has_a_group_and_a_material_for_each_label() {
-        let mesh = quad_and_triangle();
-        let text = obj(
-            &mesh.vertices,
-            &polygons(&mesh),
-            &[7, -1],
-            &infos(),
-            "m.mtl",
-        );
-        let faces = "g label_7_long_leg\nusemtl label_7_long_leg\nf 1 2 3 4\n\
-                     g unlabelled\nusemtl unlabelled\nf 2 5 3\n";
-        assert!(
-            text.starts_with("mtllib m.mtl\nv 0 0 0\n") && text.ends_with(faces),
-            "{text}"
-        );
-        assert!(materials(&infos()).contains("newmtl label_7_long_leg\nKd 0.0039 0.0078 1.0000\n"));
+    fn labels_have_their_names_and_colours() {
+        let found = materials(&infos());
+        let expected = [
+            ("label_7_long_leg".to_owned(), [1, 2, 255]),
+            ("unlabelled".to_owned(), [128, 128, 128]),
+        ];
+        assert_eq!(found, expected);
+        assert_eq!(material(8, &infos()), "label_8");
     }
 }

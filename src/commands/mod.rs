@@ -4,6 +4,8 @@ mod add;
 mod check;
 mod collections;
 mod config;
+pub(crate) mod demo;
+mod demo_ply;
 pub(crate) mod describe;
 mod events;
 mod export;
@@ -134,6 +136,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Synth(args) => synth::run(args, cli.global.json)
             .map(|()| true)
             .map_err(Into::into),
+        Command::Demo(args) => demo::run(args, &cli.global),
         Command::Stats => stats::run(session()?),
         Command::Stop => stop::run(session()?),
     }?;

@@ -24,6 +24,7 @@ use tokio::task::JoinSet;
 type Outcome = Result<Described, Failure>;
 
 /// A shape on its way to its lane.
+#[allow(clippy::large_enum_variant)] // one at a time for each worker, never in a collection
 enum Prepared {
     /// It was described, or failed to be.
     Described(Outcome),

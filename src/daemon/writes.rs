@@ -20,6 +20,7 @@ use std::sync::atomic::Ordering;
 const QUEUE_RETRY_MS: u64 = 1_000;
 
 /// How a change is answered.
+#[allow(clippy::large_enum_variant)] // returned once, never in a collection
 pub(crate) enum Done {
     /// With this.
     Now(Reply),

@@ -41,14 +41,27 @@ pub struct MapOptions {
 
 impl Default for MapOptions {
     fn default() -> Self {
-        Self { k_start: 20, k_step: 10, k_end: 60, descriptor_weight: 1.0 }
+        Self {
+            k_start: 20,
+            k_step: 10,
+            k_end: 60,
+            descriptor_weight: 1.0,
+        }
     }
 }
 
 /// The map from shape 1 to shape 2 (functions), with `p2p_21` from the vertices of 2 to those of 1.
 /// Costs about `2 n1 n2 (k + dim)` flops a round.
-pub fn descriptor_zoomout(one: &MapShape<'_>, two: &MapShape<'_>, options: &MapOptions) -> FunctionalMap {
-    let k_end = options.k_end.min(one.n_eigenvectors).min(two.n_eigenvectors).max(1);
+pub fn descriptor_zoomout(
+    one: &MapShape<'_>,
+    two: &MapShape<'_>,
+    options: &MapOptions,
+) -> FunctionalMap {
+    let k_end = options
+        .k_end
+        .min(one.n_eigenvectors)
+        .min(two.n_eigenvectors)
+        .max(1);
     let mut k = options.k_start.min(k_end);
     let mut p2p_21 = nearest_rows(two.descriptors, one.descriptors, one.dim);
     let mut c_12 = project(one, two, &p2p_21, k);
@@ -57,7 +70,14 @@ pub fn descriptor_zoomout(one: &MapShape<'_>, two: &MapShape<'_>, options: &MapO
         let beta = (options.descriptor_weight * k as f32 / mean_norm.max(1e-12) as f32).sqrt();
         let targets = embedded(one, &leading(one, k), k, beta);
         let mut carried = Mat::<f32>::zeros(two.mass.len(), k);
-        matmul(carried.as_mut(), Accum::Replace, leading(two, k).as_ref(), c_12.as_ref(), 1.0, Par::Seq);
+        matmul(
+            carried.as_mut(),
+            Accum::Replace,
+            leading(two, k).as_ref(),
+            c_12.as_ref(),
+            1.0,
+            Par::Seq,
+        );
         let queries = embedded(two, &carried, k, beta);
         p2p_21 = nearest_rows(&queries, &targets, k + one.dim);
         c_12 = project(one, two, &p2p_21, (k + options.k_step).min(k_end));
@@ -68,7 +88,13 @@ pub fn descriptor_zoomout(one: &MapShape<'_>, two: &MapShape<'_>, options: &MapO
     }
     let quality = quality(one, two, &c_12, &p2p_21);
     let c = (0..k_end).flat_map(|i| (0..k_end).map(move |j| (i, j)));
-    FunctionalMap { c_12: c.map(|(i, j)| c_12[(i, j)]).collect(), k1: k_end, k2: k_end, p2p_21, quality }
+    FunctionalMap {
+        c_12: c.map(|(i, j)| c_12[(i, j)]).collect(),
+        k1: k_end,
+        k2: k_end,
+        p2p_21,
+        quality,
+    }
 }
 
 fn row(values: &[f32], dim: usize, v: usize) -> &[f32] {
@@ -81,13 +107,19 @@ fn squared_norm(x: &[f32]) -> f64 {
 
 fn weighted_mean(mass: &[f32], value: impl Fn(usize) -> f64) -> f64 {
     let total: f64 = mass.iter().map(|m| f64::from(*m)).sum();
-    let sum: f64 = mass.iter().enumerate().map(|(v, m)| f64::from(*m) * value(v)).sum();
+    let sum: f64 = mass
+        .iter()
+        .enumerate()
+        .map(|(v, m)| f64::from(*m) * value(v))
+        .sum();
     sum / total.max(1e-300)
 }
 
 /// The first `k` eigenvectors `(n, k)`.
 fn leading(shape: &MapShape<'_>, k: usize) -> Mat<f32> {
-    Mat::from_fn(shape.mass.len(), k, |v, j| shape.eigenvectors[v * shape.n_eigenvectors + j])
+    Mat::from_fn(shape.mass.len(), k, |v, j| {
+        shape.eigenvectors[v * shape.n_eigenvectors + j]
+    })
 }
 
 /// Rows `[spectral (k), β descriptors (dim)]`, row-major.
@@ -96,7 +128,11 @@ fn embedded(shape: &MapShape<'_>, spectral: &Mat<f32>, k: usize, beta: f32) -> V
     let mut out = Vec::with_capacity(n * (k + shape.dim));
     for v in 0..n {
         out.extend((0..k).map(|j| spectral[(v, j)]));
-        out.extend(row(shape.descriptors, shape.dim, v).iter().map(|x| beta * x));
+        out.extend(
+            row(shape.descriptors, shape.dim, v)
+                .iter()
+                .map(|x| beta * x),
+        );
     }
     out
 }
@@ -112,7 +148,11 @@ fn project(one: &MapShape<'_>, two: &MapShape<'_>, p2p_21: &[u32], k: usize) -> 
         .collect();
     let pulled: Vec<f32> = p2p_21
         .iter()
-        .flat_map(|t| row(one.eigenvectors, one.n_eigenvectors, *t as usize)[..k].iter().copied())
+        .flat_map(|t| {
+            row(one.eigenvectors, one.n_eigenvectors, *t as usize)[..k]
+                .iter()
+                .copied()
+        })
         .collect();
     let mut c = Mat::<f32>::zeros(k, k);
     matmul(
@@ -130,7 +170,10 @@ fn quality(one: &MapShape<'_>, two: &MapShape<'_>, c_12: &Mat<f32>, p2p_21: &[u3
     let descriptor_residual = weighted_mean(two.mass, |v| {
         let a = row(two.descriptors, two.dim, v);
         let b = row(one.descriptors, one.dim, p2p_21[v] as usize);
-        a.iter().zip(b).map(|(x, y)| f64::from((x - y) * (x - y))).sum()
+        a.iter()
+            .zip(b)
+            .map(|(x, y)| f64::from((x - y) * (x - y)))
+            .sum()
     });
     let k = c_12.ncols();
     let gram = c_12.transpose() * c_12;
@@ -173,7 +216,9 @@ mod tests {
                 })
             })
             .collect();
-        let descriptors = (0..n).flat_map(|v| [angle(v).cos(), 0.5 * (2.0 * angle(v)).sin()]).collect();
+        let descriptors = (0..n)
+            .flat_map(|v| [angle(v).cos(), 0.5 * (2.0 * angle(v)).sin()])
+            .collect();
         (phi, vec![1.0 / n as f32; n], descriptors)
     }
 
@@ -192,7 +237,12 @@ mod tests {
             descriptors,
             dim: 2,
         };
-        let options = MapOptions { k_start: 5, k_step: 4, k_end: 21, descriptor_weight: 1.0 };
+        let options = MapOptions {
+            k_start: 5,
+            k_step: 4,
+            k_end: 21,
+            descriptor_weight: 1.0,
+        };
         let map = descriptor_zoomout(&shape(&phi1, &x1), &shape(&phi2, &x2), &options);
         let expected: Vec<u32> = shuffled.iter().map(|v| *v as u32).collect();
         assert_eq!(map.p2p_21, expected);
@@ -206,8 +256,17 @@ mod tests {
         let phi: Vec<f32> = (0..40 * 3).map(|_| rng.random_range(-1.0..1.0)).collect();
         let x: Vec<f32> = (0..40 * 2).map(|_| rng.random_range(-1.0..1.0)).collect();
         let mass = vec![1.0 / 40.0; 40];
-        let s = MapShape { eigenvectors: &phi, n_eigenvectors: 3, mass: &mass, descriptors: &x, dim: 2 };
+        let s = MapShape {
+            eigenvectors: &phi,
+            n_eigenvectors: 3,
+            mass: &mass,
+            descriptors: &x,
+            dim: 2,
+        };
         let map = descriptor_zoomout(&s, &s, &MapOptions::default());
-        assert_eq!((map.k1, map.k2, map.c_12.len(), map.p2p_21.len()), (3, 3, 9, 40));
+        assert_eq!(
+            (map.k1, map.k2, map.c_12.len(), map.p2p_21.len()),
+            (3, 3, 9, 40)
+        );
     }
 }

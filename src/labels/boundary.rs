@@ -47,11 +47,17 @@ pub fn refine_boundary(
         .edges
         .iter()
         .filter(|e| e.faces.iter().any(|f| depth[*f as usize].is_finite()))
-        .map(|e| SurfaceEdge { faces: e.faces.map(|f| local[f as usize]), ..*e })
+        .map(|e| SurfaceEdge {
+            faces: e.faces.map(|f| local[f as usize]),
+            ..*e
+        })
         .collect();
     let total: f64 = members.iter().map(|f| surface.area[*f as usize]).sum();
     let sub = Surface {
-        area: members.iter().map(|f| surface.area[*f as usize] / total.max(1e-300)).collect(),
+        area: members
+            .iter()
+            .map(|f| surface.area[*f as usize] / total.max(1e-300))
+            .collect(),
         centroids: Vec::new(),
         edges,
     };
@@ -59,7 +65,11 @@ pub fn refine_boundary(
     let mut pinned = Vec::with_capacity(members.len());
     for &f in &members {
         let p = proxy_face[f as usize] as usize;
-        unary.extend((0..k).map(|l| -(f64::from(probabilities[p * k + l]) / 255.0).max(FLOOR).ln()));
+        unary.extend((0..k).map(|l| {
+            -(f64::from(probabilities[p * k + l]) / 255.0)
+                .max(FLOOR)
+                .ln()
+        }));
         pinned.push((!depth[f as usize].is_finite()).then_some(labels[f as usize]));
     }
     let refined = cut(&sub, &unary, k, STRENGTH, Some(&pinned));
@@ -131,11 +141,17 @@ mod tests {
         let surface = strip(40, 17);
         let proxy_face: Vec<u32> = (0..40).map(|f| f / 5).collect();
         let classes: Vec<u32> = (0..8).map(|p| u32::from(p >= 4)).collect();
-        let probabilities: Vec<u8> =
-            classes.iter().flat_map(|c| if *c == 0 { [150, 105] } else { [105, 150] }).collect();
+        let probabilities: Vec<u8> = classes
+            .iter()
+            .flat_map(|c| if *c == 0 { [150, 105] } else { [105, 150] })
+            .collect();
         let refined = refine_boundary(&surface, &proxy_face, 3.0, &classes, &probabilities, 2);
         assert_eq!(refined.iter().position(|l| *l == 1), Some(18));
         let far = refine_boundary(&surface, &proxy_face, 0.5, &classes, &probabilities, 2);
-        assert_eq!(far.iter().position(|l| *l == 1), Some(20), "the crease is outside the band");
+        assert_eq!(
+            far.iter().position(|l| *l == 1),
+            Some(20),
+            "the crease is outside the band"
+        );
     }
 }

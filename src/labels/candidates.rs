@@ -28,7 +28,12 @@ const WEIGHTINGS: [[f64; 10]; 3] = [
 ];
 
 /// Labellings of all patches with exactly `k` labels, without duplicates up to renaming.
-pub(super) fn pool(shapes: &Prepared<'_>, criterion: &Criterion, k: usize, seed: u64) -> Vec<Vec<u32>> {
+pub(super) fn pool(
+    shapes: &Prepared<'_>,
+    criterion: &Criterion,
+    k: usize,
+    seed: u64,
+) -> Vec<Vec<u32>> {
     let granularities = [
         (2 * k + 4, &[0.2, 0.35, 0.5][..], 0),
         (3 * k + 6, &[0.35, 0.5][..], 2),
@@ -39,13 +44,21 @@ pub(super) fn pool(shapes: &Prepared<'_>, criterion: &Criterion, k: usize, seed:
         .each()
         .map(|s| merge_patches(s.patches, s.patch_means, shapes.dim, &sizes))
         .collect();
-    let mut found = Pool { k, seen: BTreeSet::new(), labellings: Vec::new() };
+    let mut found = Pool {
+        k,
+        seen: BTreeSet::new(),
+        labellings: Vec::new(),
+    };
     for (g, &(_, alphas, extra)) in granularities.iter().enumerate() {
         let parts = Parts::new(shapes, merged.iter().map(|m| &m[g]));
         for weighting in &WEIGHTINGS {
             let vectors = parts.vectors(shapes, weighting);
             let dim = vectors.len() / parts.len().max(1);
-            let inter = inter_shape(&Rows { values: &vectors, dim, offsets: &parts.offsets });
+            let inter = inter_shape(&Rows {
+                values: &vectors,
+                dim,
+                offsets: &parts.offsets,
+            });
             let embeddings: Vec<_> = alphas
                 .iter()
                 .map(|alpha| embedding(&combine(&inter, &parts.touching, *alpha), k + extra + 1))
@@ -90,7 +103,11 @@ impl Pool {
                 }
             }
             next.sort_by(|x, y| y.0.total_cmp(&x.0));
-            next.truncate(if size - 1 > self.k { BEAM_WIDTH } else { BEAM_KEPT });
+            next.truncate(if size - 1 > self.k {
+                BEAM_WIDTH
+            } else {
+                BEAM_KEPT
+            });
             beam = next
                 .into_iter()
                 .map(|(_, at, a, b, sums)| {
@@ -142,7 +159,8 @@ struct Parts {
 impl Parts {
     fn new<'a>(shapes: &Prepared<'_>, part_of_patch: impl Iterator<Item = &'a Vec<u32>>) -> Self {
         let mut offsets = vec![0];
-        let (mut graphs, mut numbered, mut weights, mut touching) = (vec![], vec![], vec![], vec![]);
+        let (mut graphs, mut numbered, mut weights, mut touching) =
+            (vec![], vec![], vec![], vec![]);
         for (shape, of_patch) in shapes.each().zip(part_of_patch) {
             let graph = PartGraph::new(
                 shape.surface,
@@ -171,7 +189,13 @@ impl Parts {
         }
         let n = *offsets.last().unwrap_or(&0);
         let touching = symmetric(n, touching.into_iter());
-        Self { graphs, offsets, part_of_patch: numbered, weights, touching }
+        Self {
+            graphs,
+            offsets,
+            part_of_patch: numbered,
+            weights,
+            touching,
+        }
     }
 
     fn len(&self) -> usize {
@@ -179,21 +203,37 @@ impl Parts {
     }
 
     fn patch_labels(&self, of_part: &[u32]) -> Vec<u32> {
-        self.part_of_patch.iter().map(|p| of_part[*p as usize]).collect()
+        self.part_of_patch
+            .iter()
+            .map(|p| of_part[*p as usize])
+            .collect()
     }
 
     /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group.
     fn vectors(&self, shapes: &Prepared<'_>, weighting: &[f64; 10]) -> Vec<f64> {
         let mut column_weights = Vec::with_capacity(shapes.dim);
-        for ((_, width), g) in super::features::groups(shapes.up_known).iter().zip(weighting) {
+        for ((_, width), g) in super::features::groups(shapes.up_known)
+            .iter()
+            .zip(weighting)
+        {
             column_weights.extend(std::iter::repeat_n(g / (*width as f64).sqrt(), *width));
         }
         let n_shape = PartGraph::N_SHAPE;
-        let blocks: [(fn(&PartGraph) -> &[f64], Vec<f64>); 4] = [
+        type Block = (fn(&PartGraph) -> &[f64], Vec<f64>);
+        let blocks: [Block; 4] = [
             (|g| &g.mean, column_weights.clone()),
-            (|g| &g.spread, column_weights.iter().map(|w| w * SPREAD_WEIGHT).collect()),
-            (|g| &g.context, column_weights.iter().map(|w| w * CONTEXT_WEIGHT).collect()),
-            (|g| &g.shape, vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape]),
+            (
+                |g| &g.spread,
+                column_weights.iter().map(|w| w * SPREAD_WEIGHT).collect(),
+            ),
+            (
+                |g| &g.context,
+                column_weights.iter().map(|w| w * CONTEXT_WEIGHT).collect(),
+            ),
+            (
+                |g| &g.shape,
+                vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape],
+            ),
         ];
         let total: usize = blocks.iter().map(|b| b.1.len()).sum();
         let mut out = vec![0.0; self.len() * total];
@@ -219,9 +259,17 @@ impl Parts {
 fn standardised(column: &[f64], weights: &[f64]) -> Vec<f64> {
     let total: f64 = weights.iter().sum();
     let mean = column.iter().zip(weights).map(|(x, w)| x * w).sum::<f64>() / total;
-    let variance = column.iter().zip(weights).map(|(x, w)| w * (x - mean) * (x - mean)).sum::<f64>() / total;
+    let variance = column
+        .iter()
+        .zip(weights)
+        .map(|(x, w)| w * (x - mean) * (x - mean))
+        .sum::<f64>()
+        / total;
     let deviation = variance.sqrt() + 1e-9;
-    column.iter().map(|x| ((x - mean) / deviation).clamp(-CLIP, CLIP)).collect()
+    column
+        .iter()
+        .map(|x| ((x - mean) / deviation).clamp(-CLIP, CLIP))
+        .collect()
 }
 
 /// The first `width` eigenvectors, rows scaled to length 1 (Ng, Jordan and Weiss 2001).
@@ -235,10 +283,17 @@ fn row_normalised(basis: &nalgebra::DMatrix<f64>, width: usize) -> Vec<f64> {
 }
 
 /// Diffusion coordinates after three steps, without the constant one (Coifman and Lafon 2006).
-fn diffusion(values: &[f64], basis: &nalgebra::DMatrix<f64>, degrees: &[f64], width: usize) -> Vec<f64> {
+fn diffusion(
+    values: &[f64],
+    basis: &nalgebra::DMatrix<f64>,
+    degrees: &[f64],
+    width: usize,
+) -> Vec<f64> {
     let mut out = Vec::with_capacity(basis.nrows() * (width - 1));
     for (row, degree) in basis.row_iter().zip(degrees) {
-        out.extend((1..width).map(|c| row[c] / degree.sqrt().max(1e-12) * values[c].max(0.0).powi(3)));
+        out.extend(
+            (1..width).map(|c| row[c] / degree.sqrt().max(1e-12) * values[c].max(0.0).powi(3)),
+        );
     }
     out
 }

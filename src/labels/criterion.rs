@@ -1,9 +1,10 @@
 //! How good a labelling of patches is, without any ground truth.
 //!
-//! Good labels have boundaries along concave creases and join what is alike or touches:
-//! `½ ln(concavity) + ln(association)`. Concavity is the length-weighted mean crease on label boundaries over
-//! that on all patch boundaries; association the mean over labels of the affinity within the label over all
-//! its affinity, in the joint patch graph.
+//! Good labels have boundaries along concave creases and join what is alike or touches, more than chance would:
+//! `½ ln(concavity) + ln(modularity)`. Concavity is the length-weighted mean crease on label boundaries over that
+//! on all patch boundaries; modularity the share of affinity within labels above its expectation (Newman and
+//! Girvan 2004), in the joint patch graph. Modularity rather than the plain share within labels, because the
+//! latter rewards one label that swallows most of every shape, and cannot compare different numbers of labels.
 
 use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
@@ -33,7 +34,12 @@ pub(super) struct PairSums {
 
 impl Criterion {
     /// The criterion on the patches of some shapes, whose mean descriptors are `means (n_patches, dim)`.
-    pub(super) fn new(patches: &[&PatchGraph], means: &[f64], dim: usize, offsets: &[usize]) -> Self {
+    pub(super) fn new(
+        patches: &[&PatchGraph],
+        means: &[f64],
+        dim: usize,
+        offsets: &[usize],
+    ) -> Self {
         let mut boundaries = Vec::new();
         let mut intra = Vec::new();
         for (graph, &offset) in patches.iter().zip(offsets) {
@@ -42,12 +48,20 @@ impl Criterion {
             for &([a, b], length, crease) in &graph.edges {
                 let (i, j) = (offset + a as usize, offset + b as usize);
                 boundaries.push((i as u32, j as u32, length, length * crease));
-                intra.push((i, j, length / mean_length.max(1e-300) * (-crease / CREASE_SCALE).exp()));
+                intra.push((
+                    i,
+                    j,
+                    length / mean_length.max(1e-300) * (-crease / CREASE_SCALE).exp(),
+                ));
             }
         }
         let n = *offsets.last().unwrap_or(&0);
         let intra = symmetric(n, intra.into_iter());
-        let inter = inter_shape(&Rows { values: means, dim, offsets });
+        let inter = inter_shape(&Rows {
+            values: means,
+            dim,
+            offsets,
+        });
         let length: f64 = boundaries.iter().map(|b| b.2).sum();
         let creased: f64 = boundaries.iter().map(|b| b.3).sum();
         Self {
@@ -59,8 +73,12 @@ impl Criterion {
 
     /// Pair sums of a labelling of all patches with labels below `k`.
     pub(super) fn pair_sums(&self, labels: &[u32], k: usize) -> PairSums {
-        let mut sums =
-            PairSums { k, length: vec![0.0; k * k], creased: vec![0.0; k * k], affinity: vec![0.0; k * k] };
+        let mut sums = PairSums {
+            k,
+            length: vec![0.0; k * k],
+            creased: vec![0.0; k * k],
+            affinity: vec![0.0; k * k],
+        };
         for &(i, j, length, creased) in &self.boundaries {
             let (a, b) = (labels[i as usize] as usize, labels[j as usize] as usize);
             for at in [a * k + b, b * k + a] {
@@ -76,34 +94,22 @@ impl Criterion {
         sums
     }
 
-    /// The score of a labelling, from its pair sums; higher is better.
+    /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
     pub(super) fn score(&self, sums: &PairSums) -> f64 {
-        let (concavity, association, _) = self.terms(sums);
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + association.max(1e-6).ln()
-    }
-
-    /// A score that labellings with different numbers of labels can be compared by: the association above
-    /// what chance would give (Newman and Girvan's modularity) in the place of the plain one.
-    pub(super) fn score_over_k(&self, sums: &PairSums) -> f64 {
-        let (concavity, _, modularity) = self.terms(sums);
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
-    }
-
-    fn terms(&self, sums: &PairSums) -> (f64, f64, f64) {
         let k = sums.k;
         let off_diagonal = |m: &[f64]| -> f64 {
             m.iter().sum::<f64>() - (0..k).map(|l| m[l * k + l]).sum::<f64>()
         };
-        let concavity =
-            off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9) / self.mean_crease.max(1e-300);
-        let volume = |l: usize| sums.affinity[l * k..(l + 1) * k].iter().sum::<f64>();
-        let total: f64 = (0..k).map(volume).sum();
-        let within = |l: usize| sums.affinity[l * k + l];
-        let association = (0..k).map(|l| within(l) / volume(l).max(1e-9)).sum::<f64>() / k as f64;
-        let modularity = (0..k)
-            .map(|l| within(l) / total.max(1e-300) - (volume(l) / total.max(1e-300)).powi(2))
-            .sum::<f64>();
-        (concavity, association, modularity)
+        let boundary = off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9);
+        let concavity = boundary / self.mean_crease.max(1e-300);
+        let total: f64 = sums.affinity.iter().sum::<f64>().max(1e-300);
+        let modularity: f64 = (0..k)
+            .map(|l| {
+                let volume: f64 = sums.affinity[l * k..(l + 1) * k].iter().sum();
+                sums.affinity[l * k + l] / total - (volume / total).powi(2)
+            })
+            .sum();
+        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
     }
 }
 

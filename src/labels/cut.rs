@@ -20,9 +20,17 @@ struct Energy<'a> {
 
 impl Energy<'_> {
     fn of(&self, labels: &[u32]) -> i64 {
-        let faces: i64 =
-            labels.iter().enumerate().map(|(f, l)| self.unary[f * self.k + *l as usize]).sum();
-        let edges: i64 = self.edges.iter().filter(|e| labels[e.0] != labels[e.1]).map(|e| e.2).sum();
+        let faces: i64 = labels
+            .iter()
+            .enumerate()
+            .map(|(f, l)| self.unary[f * self.k + *l as usize])
+            .sum();
+        let edges: i64 = self
+            .edges
+            .iter()
+            .filter(|e| labels[e.0] != labels[e.1])
+            .map(|e| e.2)
+            .sum();
         faces + edges
     }
 
@@ -30,9 +38,14 @@ impl Energy<'_> {
     fn expand(&self, labels: &[u32], alpha: u32) -> Vec<u32> {
         let mut network = Network::new(labels.len());
         // Sink side: takes alpha.
-        let mut take: Vec<i64> = (0..labels.len()).map(|f| self.unary[f * self.k + alpha as usize]).collect();
-        let mut keep: Vec<i64> =
-            labels.iter().enumerate().map(|(f, l)| self.unary[f * self.k + *l as usize]).collect();
+        let mut take: Vec<i64> = (0..labels.len())
+            .map(|f| self.unary[f * self.k + alpha as usize])
+            .collect();
+        let mut keep: Vec<i64> = labels
+            .iter()
+            .enumerate()
+            .map(|(f, l)| self.unary[f * self.k + *l as usize])
+            .collect();
         if let Some(fixed) = self.fixed {
             let forbid = i64::MAX / 1_000_000_000;
             for (f, pin) in fixed.iter().enumerate() {
@@ -94,13 +107,18 @@ pub fn cut(
     };
     for (f, row) in unary.chunks_exact(k).enumerate() {
         let scale = surface.area[f] * m as f64 * UNITS;
-        energy.unary.extend(row.iter().map(|u| (u.clamp(0.0, CAP_NATS) * scale).round() as i64));
+        energy.unary.extend(
+            row.iter()
+                .map(|u| (u.clamp(0.0, CAP_NATS) * scale).round() as i64),
+        );
     }
     let mut labels: Vec<u32> = unary
         .chunks_exact(k)
         .enumerate()
         .map(|(f, row)| {
-            let least = (0..k).min_by(|&a, &b| row[a].total_cmp(&row[b])).unwrap_or(0) as u32;
+            let least = (0..k)
+                .min_by(|&a, &b| row[a].total_cmp(&row[b]))
+                .unwrap_or(0) as u32;
             pinned.and_then(|p| p[f]).unwrap_or(least)
         })
         .collect();
@@ -133,16 +151,34 @@ mod tests {
             let faces = [rng.random_range(0..m as u32), rng.random_range(0..m as u32)];
             let boundary_cost = rng.random_range(0.0..1.5);
             if faces[0] != faces[1] {
-                edges.push(SurfaceEdge { faces, length: 1.0, crease: 0.0, boundary_cost });
+                edges.push(SurfaceEdge {
+                    faces,
+                    length: 1.0,
+                    crease: 0.0,
+                    boundary_cost,
+                });
             }
         }
-        Surface { area: vec![1.0 / m as f64; m], centroids: vec![[0.0; 3]; m], edges }
+        Surface {
+            area: vec![1.0 / m as f64; m],
+            centroids: vec![[0.0; 3]; m],
+            edges,
+        }
     }
 
     fn energy(s: &Surface, unary: &[f64], k: usize, labels: &[u32]) -> f64 {
-        let faces: f64 = labels.iter().enumerate().map(|(f, l)| unary[f * k + *l as usize]).sum();
+        let faces: f64 = labels
+            .iter()
+            .enumerate()
+            .map(|(f, l)| unary[f * k + *l as usize])
+            .sum();
         let cut = |e: &&SurfaceEdge| labels[e.faces[0] as usize] != labels[e.faces[1] as usize];
-        faces + s.edges.iter().filter(cut).map(|e| e.boundary_cost).sum::<f64>()
+        faces
+            + s.edges
+                .iter()
+                .filter(cut)
+                .map(|e| e.boundary_cost)
+                .sum::<f64>()
     }
 
     #[test]
@@ -154,9 +190,19 @@ mod tests {
             let unary: Vec<f64> = (0..2 * m).map(|_| rng.random_range(0.0..3.0)).collect();
             let found = energy(&s, &unary, 2, &cut(&s, &unary, 2, 1.0, None));
             let least = (0..1u32 << m)
-                .map(|b| energy(&s, &unary, 2, &(0..m).map(|f| b >> f & 1).collect::<Vec<_>>()))
+                .map(|b| {
+                    energy(
+                        &s,
+                        &unary,
+                        2,
+                        &(0..m).map(|f| b >> f & 1).collect::<Vec<_>>(),
+                    )
+                })
                 .fold(f64::INFINITY, f64::min);
-            assert!(found <= least + 1e-4, "round {round}: {found} against {least}");
+            assert!(
+                found <= least + 1e-4,
+                "round {round}: {found} against {least}"
+            );
         }
     }
 
@@ -171,9 +217,19 @@ mod tests {
             let found = energy(&s, &unary, k, &labels);
             for alpha in 0..k as u32 {
                 for subset in 0..1u32 << m {
-                    let moved: Vec<u32> =
-                        (0..m).map(|f| if subset >> f & 1 == 1 { alpha } else { labels[f] }).collect();
-                    assert!(energy(&s, &unary, k, &moved) >= found - 1e-4, "round {round}");
+                    let moved: Vec<u32> = (0..m)
+                        .map(|f| {
+                            if subset >> f & 1 == 1 {
+                                alpha
+                            } else {
+                                labels[f]
+                            }
+                        })
+                        .collect();
+                    assert!(
+                        energy(&s, &unary, k, &moved) >= found - 1e-4,
+                        "round {round}"
+                    );
                 }
             }
             let pins: Vec<Option<u32>> = (0..m).map(|f| (f % 2 == 0).then_some(2)).collect();

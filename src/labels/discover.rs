@@ -56,7 +56,11 @@ pub struct DiscoveryOptions {
 
 impl Default for DiscoveryOptions {
     fn default() -> Self {
-        Self { n_labels: None, max_labels: 8, seed: 1 }
+        Self {
+            n_labels: None,
+            max_labels: 8,
+            seed: 1,
+        }
     }
 }
 
@@ -95,20 +99,34 @@ impl<'a> Prepared<'a> {
         let (mut means, mut offsets, mut area) = (Vec::new(), vec![0], Vec::new());
         for s in &input.shapes {
             let n = s.patches.len();
-            means.extend(s.surface.patch_means(&s.patches.patch_of_face, n, &s.features.data, dim));
+            means.extend(
+                s.surface
+                    .patch_means(&s.patches.patch_of_face, n, &s.features.data, dim),
+            );
             area.extend_from_slice(&s.patches.area);
             offsets.push(area.len());
         }
-        Self { input, dim, up_known: input.up_known, means, offsets, area }
+        Self {
+            input,
+            dim,
+            up_known: input.up_known,
+            means,
+            offsets,
+            area,
+        }
     }
 
     pub(super) fn each(&self) -> impl Iterator<Item = PreparedShape<'_>> {
-        self.input.shapes.iter().zip(self.offsets.windows(2)).map(|(s, range)| PreparedShape {
-            surface: s.surface,
-            patches: s.patches,
-            features: s.features,
-            patch_means: &self.means[range[0] * self.dim..range[1] * self.dim],
-        })
+        self.input
+            .shapes
+            .iter()
+            .zip(self.offsets.windows(2))
+            .map(|(s, range)| PreparedShape {
+                surface: s.surface,
+                patches: s.patches,
+                features: s.features,
+                patch_means: &self.means[range[0] * self.dim..range[1] * self.dim],
+            })
     }
 
     fn criterion(&self) -> Criterion {
@@ -137,8 +155,15 @@ impl<'a> Prepared<'a> {
 /// square of the number of parts (about 25 a shape): meant for up to a few dozen shapes.
 pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Discovery {
     if options.n_labels == Some(1) || input.shapes.is_empty() {
-        let labels = input.shapes.iter().map(|s| vec![0; s.surface.n_faces()]).collect();
-        return Discovery { labels, n_labels: 1 };
+        let labels = input
+            .shapes
+            .iter()
+            .map(|s| vec![0; s.surface.n_faces()])
+            .collect();
+        return Discovery {
+            labels,
+            n_labels: 1,
+        };
     }
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();
@@ -149,26 +174,44 @@ pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Disco
     let chosen = range
         .filter_map(|k| {
             let labels = choose(&shapes, &criterion, k, options.seed)?;
-            Some((criterion.score_over_k(&criterion.pair_sums(&labels, k)), k, labels))
+            Some((criterion.score(&criterion.pair_sums(&labels, k)), k, labels))
         })
         .reduce(|best, next| if next.0 > best.0 { next } else { best });
     let Some((_, k, of_patch)) = chosen else {
         // Fewer patches than labels: each patch its own.
-        let labels = input.shapes.iter().map(|s| s.patches.patch_of_face.clone()).collect();
-        let n_labels = input.shapes.iter().map(|s| s.patches.len()).max().unwrap_or(1);
+        let labels = input
+            .shapes
+            .iter()
+            .map(|s| s.patches.patch_of_face.clone())
+            .collect();
+        let n_labels = input
+            .shapes
+            .iter()
+            .map(|s| s.patches.len())
+            .max()
+            .unwrap_or(1);
         return Discovery { labels, n_labels };
     };
     let of_face: Vec<Vec<u32>> = input
         .shapes
         .iter()
         .zip(&shapes.offsets)
-        .map(|(s, o)| s.patches.patch_of_face.iter().map(|p| of_patch[o + *p as usize]).collect())
+        .map(|(s, o)| {
+            s.patches
+                .patch_of_face
+                .iter()
+                .map(|p| of_patch[o + *p as usize])
+                .collect()
+        })
         .collect();
-    Discovery { labels: refine(input, of_face, k), n_labels: k }
+    Discovery {
+        labels: refine(input, of_face, k),
+        n_labels: k,
+    }
 }
 
 /// The score of a face labelling with labels below `k`, as [`discover`] would judge it; comparable between
-/// labellings of the same shapes with the same number of labels.
+/// labellings of the same shapes.
 pub fn labelling_score(input: &DiscoveryInput<'_>, labels: &[Vec<u32>], k: usize) -> f64 {
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();
@@ -178,11 +221,16 @@ pub fn labelling_score(input: &DiscoveryInput<'_>, labels: &[Vec<u32>], k: usize
 /// The labelling of patches with the best score plus consensus; `None` if there is none with `k` labels.
 fn choose(shapes: &Prepared<'_>, criterion: &Criterion, k: usize, seed: u64) -> Option<Vec<u32>> {
     let labellings = pool(shapes, criterion, k, seed);
-    let scores: Vec<f64> =
-        labellings.iter().map(|l| criterion.score(&criterion.pair_sums(l, k))).collect();
+    let scores: Vec<f64> = labellings
+        .iter()
+        .map(|l| criterion.score(&criterion.pair_sums(l, k)))
+        .collect();
     let consensus = consensus(&labellings, &scores, &shapes.area, k);
-    let total: Vec<f64> =
-        scores.iter().zip(&consensus).map(|(s, c)| s + CONSENSUS_WEIGHT * c).collect();
+    let total: Vec<f64> = scores
+        .iter()
+        .zip(&consensus)
+        .map(|(s, c)| s + CONSENSUS_WEIGHT * c)
+        .collect();
     let best = (0..total.len()).max_by(|&a, &b| total[a].total_cmp(&total[b]).then(b.cmp(&a)))?;
     labellings.into_iter().nth(best)
 }
@@ -191,7 +239,10 @@ fn choose(shapes: &Prepared<'_>, criterion: &Criterion, k: usize, seed: u64) -> 
 /// scores; areas weigh the patches.
 fn consensus(labellings: &[Vec<u32>], scores: &[f64], area: &[f64], k: usize) -> Vec<f64> {
     let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mut weights: Vec<f64> = scores.iter().map(|s| ((s - top) / TEMPERATURE).exp()).collect();
+    let mut weights: Vec<f64> = scores
+        .iter()
+        .map(|s| ((s - top) / TEMPERATURE).exp())
+        .collect();
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum);
     let total: f64 = area.iter().sum();
@@ -204,8 +255,9 @@ fn consensus(labellings: &[Vec<u32>], scores: &[f64], area: &[f64], k: usize) ->
     }
     let joint = indicator.transpose() * &indicator;
     let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
-    let own: Vec<f64> =
-        (0..n).map(|c| (0..k).map(|l| entropy(joint[(c * k + l, c * k + l)])).sum()).collect();
+    let own: Vec<f64> = (0..n)
+        .map(|c| (0..k).map(|l| entropy(joint[(c * k + l, c * k + l)])).sum())
+        .collect();
     (0..n)
         .map(|a| {
             (0..n)

@@ -29,7 +29,10 @@ impl Features {
     pub fn raw(shape: &DescriptionView<'_>, up: Option<[f64; 3]>) -> Self {
         let n = shape.n_descriptors;
         let Some(axis) = up else {
-            return Self { data: shape.face_descriptors.to_vec(), dim: n };
+            return Self {
+                data: shape.face_descriptors.to_vec(),
+                dim: n,
+            };
         };
         let columns = descriptors::up_columns(&shape.mesh(), axis);
         let mut data = Vec::with_capacity(shape.faces.len() * (n + 3));
@@ -74,7 +77,10 @@ pub struct Normalisation {
 
 impl Normalisation {
     /// Mean and deviation over shapes of equal weight; each comes as raw features and area shares.
-    pub fn fit<'a>(shapes: impl Iterator<Item = (&'a Features, &'a [f64])>, up_known: bool) -> Self {
+    pub fn fit<'a>(
+        shapes: impl Iterator<Item = (&'a Features, &'a [f64])>,
+        up_known: bool,
+    ) -> Self {
         let (mut n, mut mean, mut square) = (0.0, Vec::new(), Vec::new());
         for (features, area) in shapes {
             mean.resize(features.dim, 0.0);
@@ -89,15 +95,25 @@ impl Normalisation {
         }
         let n = f64::max(n, 1.0);
         mean.iter_mut().for_each(|m| *m /= n);
-        let deviation =
-            square.iter().zip(&mean).map(|(s, m)| (s / n - m * m).max(0.0).sqrt() + 1e-9).collect();
-        Self { mean, deviation, up_known }
+        let deviation = square
+            .iter()
+            .zip(&mean)
+            .map(|(s, m)| (s / n - m * m).max(0.0).sqrt() + 1e-9)
+            .collect();
+        Self {
+            mean,
+            deviation,
+            up_known,
+        }
     }
 
     /// `clip((x − mean) / deviation, ±4) / √(width of the column's group)`.
     pub fn standardise(&self, raw: &Features) -> Features {
         let dim = self.mean.len();
-        assert_eq!(raw.dim, dim, "features and normalisation have the same columns");
+        assert_eq!(
+            raw.dim, dim,
+            "features and normalisation have the same columns"
+        );
         let mut scale = Vec::with_capacity(dim);
         for (_, width) in groups(self.up_known) {
             scale.extend(std::iter::repeat_n(1.0 / (width as f64).sqrt(), width));
@@ -107,6 +123,9 @@ impl Normalisation {
             let z = (f64::from(x) - self.mean[c]) / self.deviation[c];
             (z.clamp(-CLIP, CLIP) * scale[c]) as f32
         };
-        Features { data: raw.data.iter().enumerate().map(standard).collect(), dim }
+        Features {
+            data: raw.data.iter().enumerate().map(standard).collect(),
+            dim,
+        }
     }
 }

@@ -28,8 +28,10 @@ pub(super) fn inter_shape(rows: &Rows<'_>) -> CsMat<f64> {
         DMatrix::from_column_slice(rows.dim, b - a, &rows.values[a * rows.dim..b * rows.dim])
     };
     let blocks: Vec<DMatrix<f64>> = (0..n_shapes).map(block).collect();
-    let norms: Vec<Vec<f64>> =
-        blocks.iter().map(|b| b.column_iter().map(|c| c.norm_squared()).collect()).collect();
+    let norms: Vec<Vec<f64>> = blocks
+        .iter()
+        .map(|b| b.column_iter().map(|c| c.norm_squared()).collect())
+        .collect();
     for a in 0..n_shapes {
         let transposed = blocks[a].transpose();
         for b in (0..n_shapes).filter(|&b| b != a) {
@@ -83,12 +85,18 @@ pub(super) fn symmetric(n: usize, upper: impl Iterator<Item = (usize, usize, f64
 
 /// Row sums.
 pub(super) fn degrees(matrix: &CsMat<f64>) -> Vec<f64> {
-    matrix.outer_iterator().map(|row| row.data().iter().sum()).collect()
+    matrix
+        .outer_iterator()
+        .map(|row| row.data().iter().sum())
+        .collect()
 }
 
 /// `D^{-1/2} M D^{-1/2}`.
 fn normalised(matrix: &CsMat<f64>) -> CsMat<f64> {
-    let roots: Vec<f64> = degrees(matrix).iter().map(|d| 1.0 / d.max(1e-12).sqrt()).collect();
+    let roots: Vec<f64> = degrees(matrix)
+        .iter()
+        .map(|d| 1.0 / d.max(1e-12).sqrt())
+        .collect();
     let mut out = matrix.clone();
     for (i, mut row) in out.outer_iterator_mut().enumerate() {
         for (j, w) in row.iter_mut() {
@@ -119,7 +127,11 @@ mod tests {
     fn links_join_like_rows_of_different_shapes_only() {
         // Two shapes of three parts each; part q of either lies near 10 q.
         let values = [0.0, 10.0, 20.0, 0.5, 10.5, 20.5];
-        let graph = inter_shape(&Rows { values: &values, dim: 1, offsets: &[0, 3, 6] });
+        let graph = inter_shape(&Rows {
+            values: &values,
+            dim: 1,
+            offsets: &[0, 3, 6],
+        });
         for (&w, (i, j)) in &graph {
             assert_ne!(i / 3, j / 3, "a link within one shape");
             assert_eq!(w, *graph.get(j, i).unwrap());
@@ -132,8 +144,14 @@ mod tests {
 
     #[test]
     fn the_normalised_graph_has_top_eigenvalue_one() {
-        let values: Vec<f64> = (0..40).map(|i| f64::from(i % 10) + 0.01 * f64::from(i)).collect();
-        let graph = inter_shape(&Rows { values: &values, dim: 1, offsets: &[0, 10, 20, 30, 40] });
+        let values: Vec<f64> = (0..40)
+            .map(|i| f64::from(i % 10) + 0.01 * f64::from(i))
+            .collect();
+        let graph = inter_shape(&Rows {
+            values: &values,
+            dim: 1,
+            offsets: &[0, 10, 20, 30, 40],
+        });
         let (top, ..) = embedding(&graph, 3);
         assert!((top[0] - 1.0).abs() < 1e-9 && top[2] <= top[1]);
     }

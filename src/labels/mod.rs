@@ -15,7 +15,8 @@ mod model;
 pub mod score;
 
 pub use boundary::refine_boundary;
-pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score};
+pub use discover::{
+    Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score,
+};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
-

@@ -21,16 +21,27 @@ pub struct Statistics {
 impl Statistics {
     /// Statistics of nothing.
     pub fn empty(k: usize, dim: usize) -> Self {
-        Self { counts: vec![0.0; k], sums: vec![0.0; k * dim], moment: vec![0.0; dim * dim] }
+        Self {
+            counts: vec![0.0; k],
+            sums: vec![0.0; k * dim],
+            moment: vec![0.0; dim * dim],
+        }
     }
 
     /// Statistics of one labelled shape; faces whose label is `None` do not count.
-    pub fn of_shape(features: &Features, area: &[f64], labels: impl Fn(usize) -> Option<u32>, k: usize) -> Self {
+    pub fn of_shape(
+        features: &Features,
+        area: &[f64],
+        labels: impl Fn(usize) -> Option<u32>,
+        k: usize,
+    ) -> Self {
         let dim = features.dim;
         let mut s = Self::empty(k, dim);
         let mut weighted = DMatrix::<f64>::zeros(dim, area.len());
         for (f, row) in features.data.chunks_exact(dim).enumerate() {
-            let Some(label) = labels(f).map(|l| l as usize) else { continue };
+            let Some(label) = labels(f).map(|l| l as usize) else {
+                continue;
+            };
             s.counts[label] += area[f];
             let root = area[f].sqrt();
             for (c, &x) in row.iter().enumerate() {
@@ -51,7 +62,9 @@ impl Statistics {
             (&mut self.moment, &other.moment),
         ];
         for (mine, theirs) in pairs {
-            mine.iter_mut().zip(theirs).for_each(|(a, b)| *a += sign * b);
+            mine.iter_mut()
+                .zip(theirs)
+                .for_each(|(a, b)| *a += sign * b);
         }
     }
 
@@ -60,7 +73,9 @@ impl Statistics {
         let k = self.counts.len();
         let dim = self.sums.len() / k.max(1);
         let total: f64 = self.counts.iter().sum();
-        let mean = DMatrix::from_fn(k, dim, |l, c| self.sums[l * dim + c] / self.counts[l].max(1e-12));
+        let mean = DMatrix::from_fn(k, dim, |l, c| {
+            self.sums[l * dim + c] / self.counts[l].max(1e-12)
+        });
         let mut within = DMatrix::from_column_slice(dim, dim, &self.moment);
         let scaled = DMatrix::from_fn(k, dim, |l, c| mean[(l, c)] * self.counts[l]);
         within -= scaled.transpose() * &mean;
@@ -71,15 +86,24 @@ impl Statistics {
             within[(c, c)] += ridge.max(1e-9);
         }
         // Shrinkage keeps it positive definite but for statistics of nothing, where weights are zero.
-        let weights = Cholesky::new(within)
-            .map_or_else(|| DMatrix::zeros(dim, k), |factor| factor.solve(&mean.transpose()));
+        let weights = Cholesky::new(within).map_or_else(
+            || DMatrix::zeros(dim, k),
+            |factor| factor.solve(&mean.transpose()),
+        );
         let bias = (0..k)
             .map(|l| {
-                let half: f64 = (0..dim).map(|c| weights[(c, l)] * mean[(l, c)]).sum::<f64>() / 2.0;
+                let half: f64 = (0..dim)
+                    .map(|c| weights[(c, l)] * mean[(l, c)])
+                    .sum::<f64>()
+                    / 2.0;
                 (self.counts[l] / total.max(1e-300)).max(1e-9).ln() - half
             })
             .collect();
-        Classifier { weights: weights.as_slice().to_vec(), bias, dim }
+        Classifier {
+            weights: weights.as_slice().to_vec(),
+            bias,
+            dim,
+        }
     }
 }
 
@@ -100,7 +124,13 @@ impl Classifier {
             let start = out.len();
             for (l, b) in self.bias.iter().enumerate() {
                 let w = &self.weights[l * self.dim..(l + 1) * self.dim];
-                out.push(b + w.iter().zip(row).map(|(w, x)| w * f64::from(*x)).sum::<f64>());
+                out.push(
+                    b + w
+                        .iter()
+                        .zip(row)
+                        .map(|(w, x)| w * f64::from(*x))
+                        .sum::<f64>(),
+                );
             }
             let scores = &mut out[start..];
             let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -149,9 +179,16 @@ mod tests {
         let (x, a, y) = blobs(1);
         let classifier = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3).classifier();
         let p = classifier.log_probabilities(&x);
-        let right = p.chunks(3).zip(&y).filter(|(p, y)| (0..3).all(|l| p[l] <= p[**y as usize])).count();
+        let right = p
+            .chunks(3)
+            .zip(&y)
+            .filter(|(p, y)| (0..3).all(|l| p[l] <= p[**y as usize]))
+            .count();
         assert!(right > 590, "{right} of 600");
-        assert!(p.chunks(3).all(|p| (p.iter().map(|v| v.exp()).sum::<f64>() - 1.0).abs() < 1e-9));
+        assert!(
+            p.chunks(3)
+                .all(|p| (p.iter().map(|v| v.exp()).sum::<f64>() - 1.0).abs() < 1e-9)
+        );
     }
 
     #[test]

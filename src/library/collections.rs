@@ -66,7 +66,9 @@ impl Library {
     /// # Errors
     /// The catalog cannot be read.
     pub fn collections(&self) -> Result<Vec<CollectionInfo>> {
-        self.store.catalog().read(|r| r.collections()?.into_iter().map(|c| info(r, c)).collect())
+        self.store
+            .catalog()
+            .read(|r| r.collections()?.into_iter().map(|c| info(r, c)).collect())
     }
 
     /// One collection.
@@ -86,8 +88,10 @@ impl Library {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
         self.once(key, request, |tx| {
             let row = tx.collection(name)?;
-            let row =
-                row.ok_or_else(|| LibraryError::NotFound { what: "collection", name: name.into() })?;
+            let row = row.ok_or_else(|| LibraryError::NotFound {
+                what: "collection",
+                name: name.into(),
+            })?;
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
             Ok(Vec::new())
@@ -114,12 +118,21 @@ impl Library {
                 let mut known = find_label(tx, lane.row.id, label)?;
                 known.name = Some(name.to_string());
                 tx.put_label(lane.row.id, &known)?;
-                event(tx, lane.row.id, &EventKind::LabelNamed { label, name: name.into() })?;
+                event(
+                    tx,
+                    lane.row.id,
+                    &EventKind::LabelNamed {
+                        label,
+                        name: name.into(),
+                    },
+                )?;
                 Ok(Vec::new())
             })
         })?;
         let row = self.collection_row(collection)?;
-        self.store.catalog().read(|r| find_label(r, row.id, label).map(label_info))
+        self.store
+            .catalog()
+            .read(|r| find_label(r, row.id, label).map(label_info))
     }
 }
 
@@ -128,12 +141,23 @@ fn find_label(
     collection: crate::store::CollectionId,
     label: LabelId,
 ) -> Result<crate::store::LabelRow> {
-    let found = reader.labels(collection)?.into_iter().find(|l| l.id == label);
-    found.ok_or_else(|| LibraryError::NotFound { what: "label", name: label.to_string() })
+    let found = reader
+        .labels(collection)?
+        .into_iter()
+        .find(|l| l.id == label);
+    found.ok_or_else(|| LibraryError::NotFound {
+        what: "label",
+        name: label.to_string(),
+    })
 }
 
 fn label_info(row: crate::store::LabelRow) -> LabelInfo {
-    LabelInfo { id: row.id, name: row.name, colour: row.colour, merged_into: row.merged_into }
+    LabelInfo {
+        id: row.id,
+        name: row.name,
+        colour: row.colour,
+        merged_into: row.merged_into,
+    }
 }
 
 fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
@@ -161,12 +185,16 @@ pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
         return Err(LibraryError::invalid("BAD_NAME", message));
     }
     if let Some(c) = name.chars().find(|c| *c == '/' || c.is_control()) {
-        let message =
-            format!("the {what} name {name:?} has {c:?}, but / and control characters are not allowed");
+        let message = format!(
+            "the {what} name {name:?} has {c:?}, but / and control characters are not allowed"
+        );
         return Err(LibraryError::invalid("BAD_NAME", message));
     }
     if name == "." || name == ".." {
-        return Err(LibraryError::invalid("BAD_NAME", format!("the {what} name is {name:?}")));
+        return Err(LibraryError::invalid(
+            "BAD_NAME",
+            format!("the {what} name is {name:?}"),
+        ));
     }
     Ok(())
 }

@@ -8,7 +8,8 @@ use super::{EventKind, Library, Placed, Result, Source};
 use crate::fmap::FunctionalMap;
 use crate::pipeline::LabelChange;
 use crate::store::{
-    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, MapRow, NewShapeRow, ObjectRow, ShapeId, ShapeRow, Tx,
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, MapRow, NewShapeRow, ObjectRow,
+    ShapeId, ShapeRow, Tx,
 };
 
 /// An addition, ready to be written.
@@ -30,14 +31,25 @@ const RECLUSTERING: &str = "reclustering";
 
 impl Library {
     /// Writes an addition and brings the lane up to it.
-    pub(super) fn commit(&self, lane: &mut Lane, mut commit: Commit<'_>, signature: Vec<f32>) -> Result<Placed> {
+    pub(super) fn commit(
+        &self,
+        lane: &mut Lane,
+        mut commit: Commit<'_>,
+        signature: Vec<f32>,
+    ) -> Result<Placed> {
         let collection = lane.row.id;
         let accepted = commit.plan.reclustered.is_some_and(|r| r.2);
         let blob = commit.plan.learnt.encode();
         let (id, row) = self.store.catalog().write(|tx| -> Result<_> {
             if let Some(old) = commit.replaced {
                 tx.delete_shape(old.id)?;
-                event(tx, collection, &EventKind::ShapeRemoved { shape: old.name.clone() })?;
+                event(
+                    tx,
+                    collection,
+                    &EventKind::ShapeRemoved {
+                        shape: old.name.clone(),
+                    },
+                )?;
             }
             tx.insert_object(&commit.object)?;
             commit.shape.ordinal = tx.take_ordinal(collection)?;
@@ -63,7 +75,11 @@ impl Library {
             if let Some((before, after, accepted)) = commit.plan.reclustered {
                 // Infinite before the first clustering, which JSON cannot hold.
                 let score_before = if before.is_finite() { before } else { f64::MIN };
-                let kind = EventKind::Reclustered { score_before, score_after: after, accepted };
+                let kind = EventKind::Reclustered {
+                    score_before,
+                    score_after: after,
+                    accepted,
+                };
                 event(tx, collection, &kind)?;
             }
             for relabelled in &mut commit.relabelled {
@@ -86,7 +102,8 @@ impl Library {
                 shape.stale = !commit.plan.state.representatives.contains(&shape.ordinal);
             }
         }
-        lane.shapes.push(KnownShape::fresh(id, commit.shape.ordinal, signature));
+        lane.shapes
+            .push(KnownShape::fresh(id, commit.shape.ordinal, signature));
         lane.row = row;
         lane.learnt = Some(commit.plan.learnt);
         lane.state = commit.plan.state;
@@ -153,19 +170,40 @@ fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> 
     match *change {
         LabelChange::Created(id) => {
             let taken = tx.take_labels(collection, 1)?;
-            assert_eq!(taken, id, "invariant: new labels are numbered as they are created");
-            let row = LabelRow { id, name: None, colour: label_colour(id), merged_into: None };
+            assert_eq!(
+                taken, id,
+                "invariant: new labels are numbered as they are created"
+            );
+            let row = LabelRow {
+                id,
+                name: None,
+                colour: label_colour(id),
+                merged_into: None,
+            };
             tx.put_label(collection, &row)?;
             event(tx, collection, &EventKind::LabelCreated { label: id })?;
         }
         LabelChange::Merged { from, into } => {
             if let Some(row) = tx.labels(collection)?.into_iter().find(|l| l.id == from) {
-                tx.put_label(collection, &LabelRow { merged_into: Some(into), ..row })?;
+                tx.put_label(
+                    collection,
+                    &LabelRow {
+                        merged_into: Some(into),
+                        ..row
+                    },
+                )?;
             }
             event(tx, collection, &EventKind::LabelMerged { from, into })?;
         }
         LabelChange::Split { from, into } => {
-            event(tx, collection, &EventKind::LabelSplit { from, into: vec![into] })?;
+            event(
+                tx,
+                collection,
+                &EventKind::LabelSplit {
+                    from,
+                    into: vec![into],
+                },
+            )?;
         }
     }
     Ok(())
@@ -173,7 +211,8 @@ fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> 
 
 /// The row of a collection that is known to be there.
 fn collection_row(tx: &Tx<'_>, id: CollectionId) -> Result<CollectionRow> {
-    tx.collection_by_id(id)?.ok_or_else(|| super::rows::damaged("collections", &format!("row {id} is gone")))
+    tx.collection_by_id(id)?
+        .ok_or_else(|| super::rows::damaged("collections", &format!("row {id} is gone")))
 }
 
 fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow {

@@ -9,13 +9,22 @@ use crate::store::StoreError;
 pub enum LibraryError {
     /// Names what is wrong and the limit. `reason` is stable.
     #[error("{message}")]
-    InvalidArgument { reason: &'static str, message: String },
+    InvalidArgument {
+        reason: &'static str,
+        message: String,
+    },
     #[error("no {what} named {name:?}")]
     NotFound { what: &'static str, name: String },
     #[error("{message}")]
-    AlreadyExists { reason: &'static str, message: String },
+    AlreadyExists {
+        reason: &'static str,
+        message: String,
+    },
     #[error("{message}")]
-    FailedPrecondition { reason: &'static str, message: String },
+    FailedPrecondition {
+        reason: &'static str,
+        message: String,
+    },
     /// A shape was refused.
     #[error("{}", .0.message)]
     Refused(Failure),

@@ -32,7 +32,8 @@ impl Lane {
         let state = if row.state.is_empty() {
             CollectionState::default()
         } else {
-            let text = std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
+            let text =
+                std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
             from_json(text, &place)?
         };
         let learnt = match reader.model(row.id)? {
@@ -46,10 +47,21 @@ impl Lane {
         let mut shapes = Vec::new();
         for s in reader.shapes(row.id, 0, usize::MAX, None)? {
             let signature = signatures.remove(&s.id);
-            let signature = signature.ok_or_else(|| damaged(&place, &format!("{} has no signature", s.name)))?;
-            shapes.push(KnownShape { id: s.id, ordinal: s.ordinal, stale: s.stale, signature });
+            let signature = signature
+                .ok_or_else(|| damaged(&place, &format!("{} has no signature", s.name)))?;
+            shapes.push(KnownShape {
+                id: s.id,
+                ordinal: s.ordinal,
+                stale: s.stale,
+                signature,
+            });
         }
-        Ok(Self { row, state, learnt, shapes })
+        Ok(Self {
+            row,
+            state,
+            learnt,
+            shapes,
+        })
     }
 
     /// The up axis, where the collection was given one.
@@ -59,16 +71,26 @@ impl Lane {
 
     /// Whether a shape's labels are part of the model of this epoch.
     pub(super) fn informs(&self, shape: &KnownShape) -> bool {
-        shape.ordinal > self.state.epoch_ordinal || self.state.representatives.contains(&shape.ordinal)
+        shape.ordinal > self.state.epoch_ordinal
+            || self.state.representatives.contains(&shape.ordinal)
     }
 
     /// Indices of the shapes nearest to a signature, nearest first.
-    pub(super) fn nearest(&self, signature: &[f32], n_descriptors: usize, limit: usize) -> Vec<(usize, f64)> {
+    pub(super) fn nearest(
+        &self,
+        signature: &[f32],
+        n_descriptors: usize,
+        limit: usize,
+    ) -> Vec<(usize, f64)> {
         let Some(learnt) = &self.learnt else {
             return Vec::new();
         };
         let metric = SignatureMetric::new(&learnt.model.normalisation, n_descriptors);
-        metric.nearest(signature, self.shapes.iter().map(|s| s.signature.as_slice()), limit)
+        metric.nearest(
+            signature,
+            self.shapes.iter().map(|s| s.signature.as_slice()),
+            limit,
+        )
     }
 
     /// Shapes to be clustered together, at most `limit`, spread evenly over the order of arrival.

@@ -17,12 +17,18 @@ pub(super) struct Learnt {
 impl Learnt {
     /// At the beginning of an epoch.
     pub(super) fn begin(model: LabelModel) -> Self {
-        Self { base: model.statistics.clone(), model }
+        Self {
+            base: model.statistics.clone(),
+            model,
+        }
     }
 
     /// The model as it was when the epoch began.
     pub(super) fn base_model(&self) -> LabelModel {
-        LabelModel { statistics: self.base.clone(), ..self.model.clone() }
+        LabelModel {
+            statistics: self.base.clone(),
+            ..self.model.clone()
+        }
     }
 
     /// The bytes.
@@ -32,7 +38,10 @@ impl Learnt {
         let k = m.labels.len();
         let labels: Vec<f64> = m.labels.iter().map(|l| f64::from(*l)).collect();
         let up = m.up.map_or(Vec::new(), |u| u.to_vec());
-        let triangles = [triangle(&m.statistics.moment, dim), triangle(&self.base.moment, dim)];
+        let triangles = [
+            triangle(&m.statistics.moment, dim),
+            triangle(&self.base.moment, dim),
+        ];
         let arrays: [(&str, Vec<usize>, &[f64]); 10] = [
             ("labels", vec![k], &labels),
             ("mean", vec![dim], &m.normalisation.mean),
@@ -45,8 +54,10 @@ impl Learnt {
             ("base_sums", vec![k, dim], &self.base.sums),
             ("base_moment", vec![triangles[1].len()], &triangles[1]),
         ];
-        let bytes: Vec<Vec<u8>> =
-            arrays.iter().map(|a| a.2.iter().flat_map(|x| x.to_le_bytes()).collect()).collect();
+        let bytes: Vec<Vec<u8>> = arrays
+            .iter()
+            .map(|a| a.2.iter().flat_map(|x| x.to_le_bytes()).collect())
+            .collect();
         let views = arrays.iter().zip(&bytes).map(|((name, shape, _), bytes)| {
             let view = TensorView::new(Dtype::F64, shape.clone(), bytes);
             (*name, view.expect("invariant: eight bytes a value"))
@@ -59,7 +70,11 @@ impl Learnt {
     pub(super) fn decode(bytes: &[u8]) -> Result<Self, String> {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| e.to_string())?;
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
-        let epoch = header.metadata().as_ref().and_then(|m| m.get("epoch")).and_then(|e| e.parse().ok());
+        let epoch = header
+            .metadata()
+            .as_ref()
+            .and_then(|m| m.get("epoch"))
+            .and_then(|e| e.parse().ok());
         let epoch = epoch.ok_or("label model without an epoch")?;
         let values = |name: &str| -> Result<Vec<f64>, String> {
             let t = tensors.tensor(name).map_err(|e| e.to_string())?;
@@ -72,27 +87,52 @@ impl Learnt {
         let (mean, deviation, labels) = (values("mean")?, values("deviation")?, values("labels")?);
         let (dim, k) = (mean.len(), labels.len());
         let statistics = |prefix: &str| -> Result<Statistics, String> {
-            let [counts, sums, moment] = ["counts", "sums", "moment"].map(|n| values(&format!("{prefix}{n}")));
+            let [counts, sums, moment] =
+                ["counts", "sums", "moment"].map(|n| values(&format!("{prefix}{n}")));
             let (counts, sums, moment) = (counts?, sums?, moment?);
             if counts.len() != k || sums.len() != k * dim || moment.len() != dim * (dim + 1) / 2 {
-                return Err(format!("label model: statistics do not fit {k} labels of {dim} columns"));
+                return Err(format!(
+                    "label model: statistics do not fit {k} labels of {dim} columns"
+                ));
             }
-            Ok(Statistics { counts, sums, moment: square(&moment, dim) })
+            Ok(Statistics {
+                counts,
+                sums,
+                moment: square(&moment, dim),
+            })
         };
         if deviation.len() != dim {
-            return Err(format!("label model: {} deviations for {dim} columns", deviation.len()));
+            return Err(format!(
+                "label model: {} deviations for {dim} columns",
+                deviation.len()
+            ));
         }
         let up = <[f64; 3]>::try_from(values("up")?).ok();
-        let normalisation = Normalisation { mean, deviation, up_known: up.is_some() };
+        let normalisation = Normalisation {
+            mean,
+            deviation,
+            up_known: up.is_some(),
+        };
         let labels = labels.into_iter().map(|l| l as u32).collect();
-        let model = LabelModel { epoch, labels, normalisation, statistics: statistics("")?, up };
-        Ok(Self { model, base: statistics("base_")? })
+        let model = LabelModel {
+            epoch,
+            labels,
+            normalisation,
+            statistics: statistics("")?,
+            up,
+        };
+        Ok(Self {
+            model,
+            base: statistics("base_")?,
+        })
     }
 }
 
 /// The lower triangle, row by row.
 fn triangle(square: &[f64], dim: usize) -> Vec<f64> {
-    (0..dim).flat_map(|i| square[i * dim..=i * dim + i].iter().copied()).collect()
+    (0..dim)
+        .flat_map(|i| square[i * dim..=i * dim + i].iter().copied())
+        .collect()
 }
 
 fn square(triangle: &[f64], dim: usize) -> Vec<f64> {
@@ -118,10 +158,19 @@ mod tests {
             sums: (0..8).map(f64::from).collect(),
             moment: (0..16).map(|i| f64::from((i / 4) * (i % 4))).collect(),
         };
-        let normalisation =
-            Normalisation { mean: vec![0.5; dim], deviation: vec![2.0; dim], up_known: true };
+        let normalisation = Normalisation {
+            mean: vec![0.5; dim],
+            deviation: vec![2.0; dim],
+            up_known: true,
+        };
         let up = Some([0.0, 1.0, 0.0]);
-        let model = LabelModel { epoch: 7, labels: vec![3, 1], normalisation, statistics, up };
+        let model = LabelModel {
+            epoch: 7,
+            labels: vec![3, 1],
+            normalisation,
+            statistics,
+            up,
+        };
         Learnt::begin(model)
     }
 

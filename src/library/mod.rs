@@ -44,9 +44,9 @@ pub use error::LibraryError;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES};
 pub use rows::report_to_json;
 pub use types::{
-    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job, JobItem,
-    LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome, PartInfo, PartMatch,
-    Placed, RequestKey, ShapeInfo, Source, Up,
+    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,
+    JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
+    PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up,
 };
 
 use crate::pipeline::Description;
@@ -117,7 +117,11 @@ impl Library {
         work: impl FnOnce(&mut Lane) -> Result<T>,
     ) -> Result<T> {
         let slot = Arc::clone(
-            self.lanes.lock().unwrap_or_else(PoisonError::into_inner).entry(row.id).or_default(),
+            self.lanes
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .entry(row.id)
+                .or_default(),
         );
         let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
         let mut lane = match slot.take() {
@@ -130,18 +134,29 @@ impl Library {
     }
 
     fn collection_row(&self, name: &str) -> Result<CollectionRow> {
-        let row = self.store.catalog().read(|r| r.collection(name).map_err(LibraryError::from))?;
-        row.ok_or_else(|| LibraryError::NotFound { what: "collection", name: name.into() })
+        let row = self
+            .store
+            .catalog()
+            .read(|r| r.collection(name).map_err(LibraryError::from))?;
+        row.ok_or_else(|| LibraryError::NotFound {
+            what: "collection",
+            name: name.into(),
+        })
     }
 
     fn note(&self, placed: &Placed) {
-        self.max_maps.fetch_max(placed.n_maps.into(), Ordering::Relaxed);
-        self.max_relabelled.fetch_max(placed.n_relabelled.into(), Ordering::Relaxed);
+        self.max_maps
+            .fetch_max(placed.n_maps.into(), Ordering::Relaxed);
+        self.max_relabelled
+            .fetch_max(placed.n_relabelled.into(), Ordering::Relaxed);
     }
 
     /// The bytes of a mesh file by their digest.
     fn original_bytes(&self, digest: &Digest) -> Result<Vec<u8>> {
-        Ok(self.store.objects().original(&self.object(crate::store::ObjectKind::Original, digest)?)?)
+        Ok(self
+            .store
+            .objects()
+            .original(&self.object(crate::store::ObjectKind::Original, digest)?)?)
     }
 
     fn object(
@@ -149,7 +164,10 @@ impl Library {
         kind: crate::store::ObjectKind,
         digest: &Digest,
     ) -> Result<crate::store::ObjectRow> {
-        let row = self.store.catalog().read(|r| r.object(kind, digest).map_err(LibraryError::from))?;
+        let row = self
+            .store
+            .catalog()
+            .read(|r| r.object(kind, digest).map_err(LibraryError::from))?;
         row.ok_or_else(|| rows::damaged("objects", &format!("no row for {digest}")))
     }
 }

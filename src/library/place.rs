@@ -8,10 +8,12 @@ use super::{Described, Library, Outcome, Placed, Result, Source};
 use crate::fmap::{FunctionalMap, MapOptions};
 use crate::labels::DiscoveryOptions;
 use crate::pipeline::{
-    DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote, label, map,
-    recluster,
+    DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote,
+    label, map, recluster,
 };
-use crate::store::{JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId, ShapeRow};
+use crate::store::{
+    JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId, ShapeRow,
+};
 use std::time::Instant;
 
 /// Most functional maps one addition computes.
@@ -62,7 +64,10 @@ impl Library {
         let description = described.description;
         let view = description.view();
         let digest = described.digest;
-        let object = self.store.objects().put_description(digest, &description, &described.params_json)?;
+        let object =
+            self.store
+                .objects()
+                .put_description(digest, &description, &described.params_json)?;
         lap("store");
         if let Some(old) = replaced {
             self.forget(lane, old)?;
@@ -75,8 +80,10 @@ impl Library {
                 n_relabelled += u32::from(self.relabel(lane, at)?);
             }
             if let Some(learnt) = &lane.learnt {
-                let known: Vec<Known> =
-                    nearest.iter().map(|(at, _)| self.known(lane.shapes[*at].id)).collect::<Result<_>>()?;
+                let known: Vec<Known> = nearest
+                    .iter()
+                    .map(|(at, _)| self.known(lane.shapes[*at].id))
+                    .collect::<Result<_>>()?;
                 let carried = carry(&view, learnt, &known);
                 sources = sources_of(&known, &carried.labelling.weights);
                 maps = known.iter().map(|k| k.row.id).zip(carried.maps).collect();
@@ -115,14 +122,29 @@ impl Library {
             stored_bytes: object.length + self.object_length(&accepted.item.original_digest)?,
         };
         let placed = Placed {
-            outcome: if replaced.is_some() { Outcome::Replaced } else { Outcome::Added },
+            outcome: if replaced.is_some() {
+                Outcome::Replaced
+            } else {
+                Outcome::Added
+            },
             version: shape.version + 1,
             sequence: 0,
             n_maps: maps.len() as u32,
             n_relabelled,
             stages_ms,
         };
-        let commit = Commit { object, shape, labels, sources, maps, relabelled, replaced, accepted, placed, plan };
+        let commit = Commit {
+            object,
+            shape,
+            labels,
+            sources,
+            maps,
+            relabelled,
+            replaced,
+            accepted,
+            placed,
+            plan,
+        };
         let placed = self.commit(lane, commit, description.signature)?;
         self.note(&placed);
         Ok(placed)
@@ -138,7 +160,11 @@ impl Library {
             Ok((row, object.ok_or_else(|| gone("description"))?, labels))
         })?;
         let mapped = self.store.objects().open_description(&object)?;
-        Ok(Known { row, mapped, labels })
+        Ok(Known {
+            row,
+            mapped,
+            labels,
+        })
     }
 
     /// Clusters the parts of the representatives and the new shape anew.
@@ -152,25 +178,42 @@ impl Library {
         for &at in &chosen {
             self.relabel(lane, at)?;
         }
-        let known: Vec<Known> =
-            chosen.iter().map(|at| self.known(lane.shapes[*at].id)).collect::<Result<_>>()?;
+        let known: Vec<Known> = chosen
+            .iter()
+            .map(|at| self.known(lane.shapes[*at].id))
+            .collect::<Result<_>>()?;
         let old = lane.learnt.as_ref().map(|l| &l.model);
         let ids = |labelling: &Labelling| -> Vec<u32> {
             let labels = old.map_or(&[][..], |m| &m.labels);
-            labelling.classes.iter().map(|c| labels[*c as usize]).collect()
+            labelling
+                .classes
+                .iter()
+                .map(|c| labels[*c as usize])
+                .collect()
         };
         let new_ids = labelling.as_ref().map(ids).unwrap_or_default();
-        let known_ids: Vec<Vec<u32>> =
-            known.iter().map(|k| k.labels.proxy_labels.iter().map(|l| *l as u32).collect()).collect();
+        let known_ids: Vec<Vec<u32>> = known
+            .iter()
+            .map(|k| k.labels.proxy_labels.iter().map(|l| *l as u32).collect())
+            .collect();
         let mut shapes: Vec<Representative<'_>> = known
             .iter()
             .zip(&known_ids)
-            .map(|(k, labels)| Representative { shape: k.mapped.view(), labels })
+            .map(|(k, labels)| Representative {
+                shape: k.mapped.view(),
+                labels,
+            })
             .collect();
-        shapes.push(Representative { shape: *view, labels: &new_ids });
+        shapes.push(Representative {
+            shape: *view,
+            labels: &new_ids,
+        });
         let n_labels = lane.row.n_parts.map(|n| n as usize);
         let options = ReclusterOptions {
-            discovery: DiscoveryOptions { n_labels, ..DiscoveryOptions::default() },
+            discovery: DiscoveryOptions {
+                n_labels,
+                ..DiscoveryOptions::default()
+            },
             up: lane.up(),
             always: shapes.len() <= TOO_FEW,
             next_label: lane.row.next_label,
@@ -178,16 +221,24 @@ impl Library {
         let epoch = old.map_or(0, |m| m.epoch) + 1;
         let outcome = recluster(&shapes, old, epoch, &options);
         let mut labellings = outcome.labellings;
-        let Some(labelling) = labellings.pop() else { unreachable!("the new shape is the last representative") };
-        let ordinals = chosen.iter().map(|at| lane.shapes[*at].ordinal).chain([lane.row.next_ordinal]);
+        let Some(labelling) = labellings.pop() else {
+            unreachable!("the new shape is the last representative")
+        };
+        let ordinals = chosen
+            .iter()
+            .map(|at| lane.shapes[*at].ordinal)
+            .chain([lane.row.next_ordinal]);
         let n_shapes = lane.shapes.len() as u64 + 1;
         let state = CollectionState {
             next_recluster: (n_shapes + 1).max((n_shapes as f64 * RECLUSTER_GROWTH).round() as u64),
             representatives: ordinals.collect(),
             epoch_ordinal: lane.row.next_ordinal,
         };
-        let relabelled =
-            if outcome.accepted { known.into_iter().zip(labellings).collect() } else { Vec::new() };
+        let relabelled = if outcome.accepted {
+            known.into_iter().zip(labellings).collect()
+        } else {
+            Vec::new()
+        };
         Ok(Plan {
             learnt: Learnt::begin(outcome.model),
             state,
@@ -273,20 +324,34 @@ pub(super) fn sources_of(known: &[Known], weights: &[f64]) -> Vec<Source> {
     known
         .iter()
         .zip(weights)
-        .map(|(k, w)| Source { shape: k.row.name.clone(), version: k.row.version, weight: *w })
+        .map(|(k, w)| Source {
+            shape: k.row.name.clone(),
+            version: k.row.version,
+            weight: *w,
+        })
         .collect()
 }
 
 /// Classes of a model, given label ids; an id the model does not know counts as the first class.
 pub(super) fn classes_of(ids: &[i32], labels: &[u32]) -> Vec<u32> {
     ids.iter()
-        .map(|id| labels.iter().position(|l| i64::from(*l) == i64::from(*id)).unwrap_or(0) as u32)
+        .map(|id| {
+            labels
+                .iter()
+                .position(|l| i64::from(*l) == i64::from(*id))
+                .unwrap_or(0) as u32
+        })
         .collect()
 }
 
 impl KnownShape {
     /// The shape as it is when it has just been labelled.
     pub(super) fn fresh(id: ShapeId, ordinal: u64, signature: Vec<f32>) -> Self {
-        Self { id, ordinal, stale: false, signature }
+        Self {
+            id,
+            ordinal,
+            stale: false,
+            signature,
+        }
     }
 }

@@ -30,7 +30,10 @@ impl Library {
     ) -> Result<Vec<ShapeInfo>> {
         let id = self.collection_row(collection)?.id;
         self.store.catalog().read(|r| {
-            r.shapes(id, after_ordinal, limit, label)?.into_iter().map(shape_info).collect()
+            r.shapes(id, after_ordinal, limit, label)?
+                .into_iter()
+                .map(shape_info)
+                .collect()
         })
     }
 
@@ -55,7 +58,10 @@ impl Library {
             })
         })?;
         let name = || format!("{} of shape {shape:?}", version.unwrap_or(row.version));
-        found.map(labels).ok_or_else(|| LibraryError::NotFound { what: "version", name: name() })
+        found.map(labels).ok_or_else(|| LibraryError::NotFound {
+            what: "version",
+            name: name(),
+        })
     }
 
     /// The bytes of a shape as they were sent, and their format.
@@ -84,20 +90,41 @@ impl Library {
     pub fn map(&self, collection: &str, from: &str, to: &str) -> Result<MapInfo> {
         let (_, a) = self.shape_row(collection, from)?;
         let (row, b) = self.shape_row(collection, to)?;
-        let kept = self.store.catalog().read(|r| r.map(a.id, b.id).map_err(LibraryError::from))?;
+        let kept = self
+            .store
+            .catalog()
+            .read(|r| r.map(a.id, b.id).map_err(LibraryError::from))?;
         if let Some(m) = kept {
             let quality = quality_from_json(&m.quality_json, &format!("maps {from} {to}"))?;
             let (k1, k2) = (m.k1 as usize, m.k2 as usize);
-            return Ok(MapInfo { c_12: m.c_12, k2, k1, p2p_21: m.p2p_21, quality });
+            return Ok(MapInfo {
+                c_12: m.c_12,
+                k2,
+                k1,
+                p2p_21: m.p2p_21,
+                quality,
+            });
         }
-        let model = self.with_lane(row, |lane| Ok(lane.learnt.as_ref().map(|l| l.model.clone())))?;
+        let model = self.with_lane(row, |lane| {
+            Ok(lane.learnt.as_ref().map(|l| l.model.clone()))
+        })?;
         let model = model.ok_or_else(|| damaged("collections", "shapes without a label model"))?;
         let (a, b) = (self.known(a.id)?, self.known(b.id)?);
         let (one, two) = (a.mapped.view(), b.mapped.view());
         let prepared = [Prepared::new(&one, &model), Prepared::new(&two, &model)];
-        let found = map((&one, &prepared[0]), (&two, &prepared[1]), &MapOptions::default());
+        let found = map(
+            (&one, &prepared[0]),
+            (&two, &prepared[1]),
+            &MapOptions::default(),
+        );
         let (k1, k2) = (found.k1, found.k2);
-        Ok(MapInfo { c_12: found.c_12, k2, k1, p2p_21: found.p2p_21, quality: found.quality })
+        Ok(MapInfo {
+            c_12: found.c_12,
+            k2,
+            k1,
+            p2p_21: found.p2p_21,
+            quality: found.quality,
+        })
     }
 
     /// Which part of A matches which part of B under the map from A to B, by descending overlap, and how good the
@@ -116,7 +143,12 @@ impl Library {
             let known = self.known(self.shape_row(collection, name)?.1.id)?;
             let view = known.mapped.view();
             let surface = Surface::new(&view.mesh());
-            let ids: Vec<u32> = known.labels.proxy_labels.iter().map(|l| *l as u32).collect();
+            let ids: Vec<u32> = known
+                .labels
+                .proxy_labels
+                .iter()
+                .map(|l| *l as u32)
+                .collect();
             let pieces = parts(&surface, &ids);
             let n = view.vertices.len();
             let of_vertex = part_of_vertex(&pieces, n, view.faces, &surface.area);
@@ -153,7 +185,10 @@ impl Library {
         let ranked = self.with_lane(row, |lane| {
             let wanted = limit.saturating_add(1);
             let found = lane.nearest(view.signature, view.n_descriptors, wanted);
-            Ok(found.into_iter().map(|(at, d)| (lane.shapes[at].id, d)).collect::<Vec<_>>())
+            Ok(found
+                .into_iter()
+                .map(|(at, d)| (lane.shapes[at].id, d))
+                .collect::<Vec<_>>())
         })?;
         self.store.catalog().read(|r| {
             let others = ranked.iter().filter(|(id, _)| *id != shape.id).take(limit);
@@ -200,7 +235,10 @@ impl Library {
                 .map(|e| {
                     let place = format!("events {collection}, {}", e.sequence);
                     let kind: EventKind = from_json(&e.payload_json, &place)?;
-                    Ok(Event { sequence: e.sequence, kind })
+                    Ok(Event {
+                        sequence: e.sequence,
+                        kind,
+                    })
                 })
                 .collect()
         })
@@ -211,7 +249,10 @@ impl Library {
     /// # Errors
     /// The catalog cannot be read.
     pub fn stats(&self) -> Result<LibraryStats> {
-        let totals = self.store.catalog().read(|r| r.totals().map_err(LibraryError::from))?;
+        let totals = self
+            .store
+            .catalog()
+            .read(|r| r.totals().map_err(LibraryError::from))?;
         Ok(LibraryStats {
             n_collections: totals.n_collections,
             n_shapes: totals.n_shapes,
@@ -248,7 +289,13 @@ impl Library {
             let id = lane.row.id;
             self.once(key, request, |tx| {
                 tx.delete_shape(gone.id)?;
-                super::commit::event(tx, id, &EventKind::ShapeRemoved { shape: shape.into() })?;
+                super::commit::event(
+                    tx,
+                    id,
+                    &EventKind::ShapeRemoved {
+                        shape: shape.into(),
+                    },
+                )?;
                 if let Some(blob) = &blob {
                     tx.set_model(id, blob)?;
                 }
@@ -265,12 +312,19 @@ impl Library {
     /// # Errors
     /// There is no such collection, or the store fails.
     pub fn relabel_next(&self, collection: Option<&str>) -> Result<bool> {
-        let wanted = collection.map(|name| self.collection_row(name)).transpose()?;
+        let wanted = collection
+            .map(|name| self.collection_row(name))
+            .transpose()?;
         let next = self.store.catalog().read(|r| -> Result<_> {
-            let Some(shape) = r.next_stale(wanted.map(|c| c.id))? else { return Ok(None) };
-            Ok(r.collection_by_id(shape.collection)?.map(|row| (row, shape.id)))
+            let Some(shape) = r.next_stale(wanted.map(|c| c.id))? else {
+                return Ok(None);
+            };
+            Ok(r.collection_by_id(shape.collection)?
+                .map(|row| (row, shape.id)))
         })?;
-        let Some((row, id)) = next else { return Ok(false) };
+        let Some((row, id)) = next else {
+            return Ok(false);
+        };
         self.with_lane(row, |lane| {
             let at = lane.shapes.iter().position(|s| s.id == id);
             at.map_or(Ok(false), |at| self.relabel(lane, at))
@@ -281,8 +335,10 @@ impl Library {
         self.store.catalog().read(|r| {
             let row = require_collection(r, collection)?;
             let found = r.shape_by_name(row.id, shape)?;
-            let found = found
-                .ok_or_else(|| LibraryError::NotFound { what: "shape", name: shape.into() })?;
+            let found = found.ok_or_else(|| LibraryError::NotFound {
+                what: "shape",
+                name: shape.into(),
+            })?;
             Ok((row, found))
         })
     }
@@ -290,14 +346,21 @@ impl Library {
 
 fn require_collection(reader: &Reader<'_>, name: &str) -> Result<CollectionRow> {
     let row = reader.collection(name)?;
-    row.ok_or_else(|| LibraryError::NotFound { what: "collection", name: name.into() })
+    row.ok_or_else(|| LibraryError::NotFound {
+        what: "collection",
+        name: name.into(),
+    })
 }
 
 fn labels(row: LabelVersionRow) -> Labels {
     Labels {
         version: row.version,
         labels: row.polygon_labels,
-        confidence: row.polygon_confidence.into_iter().map(confidence_from_u8).collect(),
+        confidence: row
+            .polygon_confidence
+            .into_iter()
+            .map(confidence_from_u8)
+            .collect(),
     }
 }
 

@@ -54,7 +54,8 @@ impl Library {
         let pieces = parts(&surface, &labelling.classes);
         let mut confident_area = vec![0.0; pieces.label.len()];
         for (f, part) in pieces.part_of_face.iter().enumerate() {
-            confident_area[*part as usize] += surface.area[f] * probability(f, labelling.classes[f]);
+            confident_area[*part as usize] +=
+                surface.area[f] * probability(f, labelling.classes[f]);
         }
         let infos: Vec<PartInfo> = (0..pieces.label.len())
             .map(|p| PartInfo {
@@ -90,13 +91,28 @@ impl Library {
         Ok(out)
     }
 
-    fn relabelled(&self, known: &Known, labelling: &Labelling, ids: &[LabelId]) -> Result<Relabelled> {
+    fn relabelled(
+        &self,
+        known: &Known,
+        labelling: &Labelling,
+        ids: &[LabelId],
+    ) -> Result<Relabelled> {
         let view = known.mapped.view();
         let original = || self.original_bytes(&known.row.content_digest);
-        let mut labels = self.finish_labels(&view, labelling, ids, (&original, &known.row.format))?;
+        let mut labels =
+            self.finish_labels(&view, labelling, ids, (&original, &known.row.format))?;
         labels.row.version = known.row.version + 1;
-        let moves = moves(&known.labels.polygon_labels, &labels.row.polygon_labels, view.polygon_area);
-        Ok(Relabelled { shape: known.row.id, name: known.row.name.clone(), labels, moves })
+        let moves = moves(
+            &known.labels.polygon_labels,
+            &labels.row.polygon_labels,
+            view.polygon_area,
+        );
+        Ok(Relabelled {
+            shape: known.row.id,
+            name: known.row.name.clone(),
+            labels,
+            moves,
+        })
     }
 
     /// Labels a stale shape anew from kept maps and the model its epoch began with: a vote and a cut. Whether it was
@@ -121,7 +137,8 @@ impl Library {
         for map in kept.into_iter().filter(|m| is_source(m.from)) {
             sources.push(self.known(map.from)?);
             let place = format!("maps {} {}", map.from, map.to);
-            let residual = super::rows::quality_from_json(&map.quality_json, &place)?.descriptor_residual;
+            let residual =
+                super::rows::quality_from_json(&map.quality_json, &place)?.descriptor_residual;
             maps.push((map.p2p_21, residual));
         }
         let views: Vec<DescriptionView<'_>> = sources.iter().map(|k| k.mapped.view()).collect();
@@ -153,7 +170,12 @@ fn polygon_classes(
     k: usize,
     (original, format): Original<'_>,
 ) -> Result<Vec<u32>> {
-    let plain = || view.face_map.iter().map(|p| labelling.classes[*p as usize]).collect();
+    let plain = || {
+        view.face_map
+            .iter()
+            .map(|p| labelling.classes[*p as usize])
+            .collect()
+    };
     let one_class = labelling.classes.iter().all(|c| *c == labelling.classes[0]);
     if view.face_map.len() <= view.faces.len() || one_class {
         return Ok(plain());
@@ -161,8 +183,12 @@ fn polygon_classes(
     let format = format_from_name(format, "shapes.format")?;
     let bytes = original()?;
     // The same bytes passed these two steps when they were described.
-    let Ok(parsed) = mesh::parse(&bytes, format) else { return Ok(plain()) };
-    let Ok(cleaned) = mesh::clean(&parsed) else { return Ok(plain()) };
+    let Ok(parsed) = mesh::parse(&bytes, format) else {
+        return Ok(plain());
+    };
+    let Ok(cleaned) = mesh::clean(&parsed) else {
+        return Ok(plain());
+    };
     let mut proxy_face = vec![0u32; cleaned.mesh.faces.len()];
     let mut seen = vec![false; proxy_face.len()];
     for (t, face) in cleaned.face_of_triangle.iter().enumerate() {
@@ -173,8 +199,14 @@ fn polygon_classes(
     }
     let surface = Surface::new(&cleaned.mesh);
     let edge = mean_edge(&view.mesh());
-    let classes =
-        refine_boundary(&surface, &proxy_face, edge, &labelling.classes, &labelling.probabilities, k);
+    let classes = refine_boundary(
+        &surface,
+        &proxy_face,
+        edge,
+        &labelling.classes,
+        &labelling.probabilities,
+        k,
+    );
     // A polygon takes the class of most of its area.
     let mut area = vec![0.0; view.face_map.len() * k];
     for (t, face) in cleaned.face_of_triangle.iter().enumerate() {
@@ -182,8 +214,14 @@ fn polygon_classes(
         area[polygon * k + classes[face] as usize] += surface.area[face].max(1e-300);
     }
     let most = |(p, row): (usize, &[f64])| {
-        let best = (0..k).max_by(|&a, &b| row[a].total_cmp(&row[b]).then(b.cmp(&a))).unwrap_or(0);
-        if row[best] > 0.0 { best as u32 } else { labelling.classes[view.face_map[p] as usize] }
+        let best = (0..k)
+            .max_by(|&a, &b| row[a].total_cmp(&row[b]).then(b.cmp(&a)))
+            .unwrap_or(0);
+        if row[best] > 0.0 {
+            best as u32
+        } else {
+            labelling.classes[view.face_map[p] as usize]
+        }
     };
     Ok(area.chunks_exact(k).enumerate().map(most).collect())
 }
@@ -192,7 +230,10 @@ fn mean_edge(mesh: &mesh::TriMesh) -> f64 {
     let mut sum = 0.0;
     for f in &mesh.faces {
         for c in 0..3 {
-            let (a, b) = (mesh.vertices[f[c] as usize], mesh.vertices[f[(c + 1) % 3] as usize]);
+            let (a, b) = (
+                mesh.vertices[f[c] as usize],
+                mesh.vertices[f[(c + 1) % 3] as usize],
+            );
             sum += (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt();
         }
     }
@@ -209,9 +250,12 @@ fn moves(before: &[i32], after: &[i32], area: &[f32]) -> Vec<LabelMove> {
     }
     let mut out: Vec<LabelMove> = moved
         .into_iter()
-        .map(|((from, to), area_share)| LabelMove { from: from.into(), to: to.into(), area_share })
+        .map(|((from, to), area_share)| LabelMove {
+            from: from.into(),
+            to: to.into(),
+            area_share,
+        })
         .collect();
     out.sort_by(|a, b| b.area_share.total_cmp(&a.area_share));
     out
 }
-

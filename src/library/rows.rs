@@ -29,19 +29,30 @@ pub(super) fn from_json<'a, T: Deserialize<'a>>(text: &'a str, place: &str) -> R
 
 /// A row of the catalog that does not hold what was written.
 pub(super) fn damaged(place: &str, message: &str) -> LibraryError {
-    StoreError::Damaged { path: place.to_string(), message: message.to_string() }.into()
+    StoreError::Damaged {
+        path: place.to_string(),
+        message: message.to_string(),
+    }
+    .into()
 }
 
 /// A clean report as JSON.
 pub fn report_to_json(report: &CleanReport) -> Value {
-    Value::Object(report.counts().into_iter().map(|(name, n)| (name.into(), json!(n))).collect())
+    Value::Object(
+        report
+            .counts()
+            .into_iter()
+            .map(|(name, n)| (name.into(), json!(n)))
+            .collect(),
+    )
 }
 
 pub(super) fn report_from_json(text: &str, place: &str) -> Result<CleanReport> {
     let value: Value = from_json(text, place)?;
     CleanReport::from_counts(|name| {
         let n = value.get(name).and_then(Value::as_u64);
-        n.map(|n| n as usize).ok_or_else(|| damaged(place, &format!("no count {name:?}")))
+        n.map(|n| n as usize)
+            .ok_or_else(|| damaged(place, &format!("no count {name:?}")))
     })
 }
 
@@ -58,7 +69,10 @@ pub(super) fn quality_to_json(q: &Quality) -> String {
 pub(super) fn quality_from_json(text: &str, place: &str) -> Result<Quality> {
     let value: Value = from_json(text, place)?;
     let number = |name: &str| -> Result<f64> {
-        value.get(name).and_then(Value::as_f64).ok_or_else(|| damaged(place, &format!("no number {name:?}")))
+        value
+            .get(name)
+            .and_then(Value::as_f64)
+            .ok_or_else(|| damaged(place, &format!("no number {name:?}")))
     };
     Ok(Quality {
         descriptor_residual: number("descriptor_residual")?,
@@ -92,7 +106,9 @@ pub(super) fn format_name(format: Format) -> &'static str {
 }
 
 pub(super) fn format_from_name(name: &str, place: &str) -> Result<Format> {
-    let found = [Format::Obj, Format::Off].into_iter().find(|f| format_name(*f) == name);
+    let found = [Format::Obj, Format::Off]
+        .into_iter()
+        .find(|f| format_name(*f) == name);
     found.ok_or_else(|| damaged(place, &format!("no format is named {name:?}")))
 }
 

@@ -3,8 +3,8 @@
 use super::collections::check_name;
 use super::rows::{damaged, format_from_name, format_name, from_json, operator_from_name, to_json};
 use super::{
-    Described, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError, NewShape, Outcome, Placed,
-    RequestKey, Result,
+    Described, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError, NewShape,
+    Outcome, Placed, RequestKey, Result,
 };
 use crate::mesh::{CleanError, ParseError};
 use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, describe};
@@ -34,7 +34,9 @@ impl Library {
         for s in &shapes {
             check_name("shape", &s.name, MAX_SHAPE_NAME)?;
             let what = format!("{:?} {} {}", s.name, format_name(s.format), s.replace);
-            request.update(what.as_bytes()).update(&Digest::of(&s.bytes).0);
+            request
+                .update(what.as_bytes())
+                .update(&Digest::of(&s.bytes).0);
         }
         let request = Digest(*request.finalize().as_bytes());
         self.collection_row(collection)?;
@@ -68,12 +70,21 @@ impl Library {
     pub fn job(&self, id: u64) -> Result<Job> {
         let (job, items) = self.store.catalog().read(|r| -> Result<_> {
             let job = r.job(id)?;
-            let job =
-                job.ok_or_else(|| LibraryError::NotFound { what: "job", name: id.to_string() })?;
+            let job = job.ok_or_else(|| LibraryError::NotFound {
+                what: "job",
+                name: id.to_string(),
+            })?;
             Ok((job, r.job_items(id)?))
         })?;
-        let items = items.into_iter().map(|i| self.item(i)).collect::<Result<_>>()?;
-        Ok(Job { id, collection: job.collection, items })
+        let items = items
+            .into_iter()
+            .map(|i| self.item(i))
+            .collect::<Result<_>>()?;
+        Ok(Job {
+            id,
+            collection: job.collection,
+            items,
+        })
     }
 
     /// Items not yet done, in order of acceptance: what a daemon takes up again when it starts.
@@ -81,7 +92,10 @@ impl Library {
     /// # Errors
     /// The catalog cannot be read.
     pub fn queued_items(&self) -> Result<Vec<JobItem>> {
-        let rows = self.store.catalog().read(|r| r.queued_items().map_err(LibraryError::from))?;
+        let rows = self
+            .store
+            .catalog()
+            .read(|r| r.queued_items().map_err(LibraryError::from))?;
         rows.into_iter().map(|i| self.item(i)).collect()
     }
 
@@ -92,7 +106,11 @@ impl Library {
     pub fn cancel(&self, job: u64) -> Result<Job> {
         self.job(job)?;
         self.store.catalog().write(|tx| -> Result<()> {
-            for item in tx.job_items(job)?.iter().filter(|i| i.status == ItemStatus::Queued) {
+            for item in tx
+                .job_items(job)?
+                .iter()
+                .filter(|i| i.status == ItemStatus::Queued)
+            {
                 tx.set_item(job, item.index, ItemStatus::Cancelled, None)?;
             }
             Ok(())
@@ -116,12 +134,12 @@ impl Library {
     pub fn needs_description(&self, item: &JobItem) -> Result<bool> {
         let row = self.item_row(item)?;
         let id = self.collection_row(&item.collection)?.id;
-        let existing = self.store.catalog().read(|r| -> Result<Option<ShapeRow>> {
-            Ok(r.shape_by_name(id, &item.name)?)
-        })?;
-        let replaced = |shape: ShapeRow| {
-            row.item.replace && shape.content_digest != row.item.original_digest
-        };
+        let existing = self
+            .store
+            .catalog()
+            .read(|r| -> Result<Option<ShapeRow>> { Ok(r.shape_by_name(id, &item.name)?) })?;
+        let replaced =
+            |shape: ShapeRow| row.item.replace && shape.content_digest != row.item.original_digest;
         Ok(row.status == ItemStatus::Queued && existing.is_none_or(replaced))
     }
 
@@ -137,7 +155,10 @@ impl Library {
     ) -> std::result::Result<Described, Failure> {
         let key = (item.job, item.index);
         let described = self.describe_bytes(item, stage);
-        self.running.lock().unwrap_or_else(PoisonError::into_inner).remove(&key);
+        self.running
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .remove(&key);
         described
     }
 
@@ -147,9 +168,13 @@ impl Library {
         stage: &dyn Fn(&str) -> bool,
     ) -> std::result::Result<Described, Failure> {
         let row = self.item_row(item).map_err(|e| failure(&e))?;
-        let collection = self.collection_row(&item.collection).map_err(|e| failure(&e))?;
+        let collection = self
+            .collection_row(&item.collection)
+            .map_err(|e| failure(&e))?;
         let (params, params_json) = params_of(&collection).map_err(|e| failure(&e))?;
-        let bytes = self.original_bytes(&row.item.original_digest).map_err(|e| failure(&e))?;
+        let bytes = self
+            .original_bytes(&row.item.original_digest)
+            .map_err(|e| failure(&e))?;
         let format =
             format_from_name(&row.item.format, "job_items.format").map_err(|e| failure(&e))?;
         let laps = RefCell::new((Vec::<(String, f64)>::new(), Instant::now()));
@@ -175,7 +200,12 @@ impl Library {
         lap();
         let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm());
         let stages_ms = laps.into_inner().0;
-        Ok(Described { description, stages_ms, digest, params_json })
+        Ok(Described {
+            description,
+            stages_ms,
+            digest,
+            params_json,
+        })
     }
 
     /// Places a described item and commits it, or commits that it failed. To be called in the order of acceptance
@@ -190,7 +220,10 @@ impl Library {
     ) -> Result<ItemState> {
         let Ok(collection) = self.collection_row(&item.collection) else {
             let name = item.collection.clone();
-            let gone = LibraryError::NotFound { what: "collection", name };
+            let gone = LibraryError::NotFound {
+                what: "collection",
+                name,
+            };
             return self.fail(item, failure(&gone));
         };
         self.with_lane(collection, |lane| {
@@ -200,7 +233,9 @@ impl Library {
             }
             let read = |name: &str| {
                 let id = lane.row.id;
-                self.store.catalog().read(|r| r.shape_by_name(id, name).map_err(LibraryError::from))
+                self.store
+                    .catalog()
+                    .read(|r| r.shape_by_name(id, name).map_err(LibraryError::from))
             };
             let existing: Option<ShapeRow> = read(&item.name)?;
             match &existing {
@@ -290,16 +325,26 @@ impl Library {
 
     fn fail(&self, item: &JobItem, why: Failure) -> Result<ItemState> {
         let cancelled = why.code == "CANCELLED";
-        let status = if cancelled { ItemStatus::Cancelled } else { ItemStatus::Failed };
+        let status = if cancelled {
+            ItemStatus::Cancelled
+        } else {
+            ItemStatus::Failed
+        };
         self.store.catalog().write(|tx| -> Result<()> {
             Ok(tx.set_item(item.job, item.index, status, Some(&to_json(&why)))?)
         })?;
-        Ok(if cancelled { ItemState::Cancelled } else { ItemState::Failed(why) })
+        Ok(if cancelled {
+            ItemState::Cancelled
+        } else {
+            ItemState::Failed(why)
+        })
     }
 
     fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
-        let rows =
-            self.store.catalog().read(|r| r.job_items(item.job).map_err(LibraryError::from))?;
+        let rows = self
+            .store
+            .catalog()
+            .read(|r| r.job_items(item.job).map_err(LibraryError::from))?;
         let row = rows.into_iter().find(|r| r.index == item.index);
         row.ok_or_else(|| LibraryError::NotFound {
             what: "job item",
@@ -309,7 +354,11 @@ impl Library {
 
     fn item(&self, row: JobItemRow) -> Result<JobItem> {
         let place = format!("job_items {}, {}", row.job, row.index);
-        let detail = || row.detail_json.as_deref().ok_or_else(|| damaged(&place, "no detail"));
+        let detail = || {
+            row.detail_json
+                .as_deref()
+                .ok_or_else(|| damaged(&place, "no detail"))
+        };
         let state = match row.status {
             ItemStatus::Queued => {
                 let running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
@@ -331,7 +380,9 @@ impl Library {
 }
 
 fn unix_secs() -> u64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
+    SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |d| d.as_secs())
 }
 
 /// What decides the bits of a description besides bytes and parameters: the algorithm, and the instruction set that
@@ -343,7 +394,11 @@ fn algorithm() -> String {
 /// The parameters of a collection's descriptions, and the text that names them.
 fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
     let operator = operator_from_name(&row.operator, &format!("collections {}", row.name))?;
-    let params = Params { operator, working_faces: row.working_faces, ..Params::default() };
+    let params = Params {
+        operator,
+        working_faces: row.working_faces,
+        ..Params::default()
+    };
     let json = serde_json::json!({
         "operator": row.operator,
         "working_faces": params.working_faces,
@@ -375,7 +430,12 @@ fn failure(error: &LibraryError) -> Failure {
         LibraryError::Store(e) if e.is_damage() => ("DATA_LOSS", "DAMAGED"),
         LibraryError::Store(_) => ("INTERNAL", "STORE"),
     };
-    Failure { code: code.into(), reason: reason.into(), message: error.to_string(), subject: None }
+    Failure {
+        code: code.into(),
+        reason: reason.into(),
+        message: error.to_string(),
+        subject: None,
+    }
 }
 
 /// Why a mesh could not be described, as the failure of an item.
@@ -393,7 +453,12 @@ fn refusal(error: &DescribeError) -> Failure {
         DescribeError::Parse(e) => parse_subject(e),
         _ => None,
     };
-    Failure { code: code.into(), reason: reason.into(), message: error.to_string(), subject }
+    Failure {
+        code: code.into(),
+        reason: reason.into(),
+        message: error.to_string(),
+        subject,
+    }
 }
 
 fn parse_reason(error: &ParseError) -> &'static str {

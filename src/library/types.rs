@@ -37,7 +37,10 @@ impl Up {
 
     /// Unit vector in input coordinates; `None` where the axis is not given.
     pub fn axis(self) -> Option<[f64; 3]> {
-        let at = Self::NAMES.iter().position(|n| n.0 == self).filter(|i| *i < 6)?;
+        let at = Self::NAMES
+            .iter()
+            .position(|n| n.0 == self)
+            .filter(|i| *i < 6)?;
         let mut axis = [0.0; 3];
         axis[at / 2] = if at.is_multiple_of(2) { 1.0 } else { -1.0 };
         Some(axis)
@@ -46,7 +49,12 @@ impl Up {
 
 impl std::fmt::Display for Up {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(Self::NAMES.iter().find(|n| n.0 == *self).map_or("unknown", |n| n.1))
+        f.write_str(
+            Self::NAMES
+                .iter()
+                .find(|n| n.0 == *self)
+                .map_or("unknown", |n| n.1),
+        )
     }
 }
 
@@ -55,7 +63,9 @@ impl std::str::FromStr for Up {
 
     fn from_str(s: &str) -> Result<Self, String> {
         let found = Self::NAMES.iter().find(|n| n.1.eq_ignore_ascii_case(s));
-        found.map(|n| n.0).ok_or_else(|| format!("up is {s:?}, but must be one of +x -x +y -y +z -z unknown auto"))
+        found.map(|n| n.0).ok_or_else(|| {
+            format!("up is {s:?}, but must be one of +x -x +y -y +z -z unknown auto")
+        })
     }
 }
 

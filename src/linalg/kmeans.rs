@@ -7,7 +7,14 @@ use rand_pcg::Pcg64;
 /// each row `(n,)`. The best of `n_starts` seeded starts by the weighted sum of squared distances
 /// wins; a cluster that runs empty is restarted at the row farthest from its centre. With `k >= n`
 /// every row is its own cluster. Costs `O(n k dim)` an iteration.
-pub fn kmeans(points: &[f64], dim: usize, weights: &[f64], k: usize, seed: u64, n_starts: usize) -> Vec<u32> {
+pub fn kmeans(
+    points: &[f64],
+    dim: usize,
+    weights: &[f64],
+    k: usize,
+    seed: u64,
+    n_starts: usize,
+) -> Vec<u32> {
     let n = weights.len();
     assert_eq!(points.len(), n * dim, "points are n x dim");
     if k >= n {
@@ -50,21 +57,26 @@ fn plus_plus(points: &[f64], dim: usize, weights: &[f64], k: usize, rng: &mut Pc
     let row = |i: usize| &points[i * dim..(i + 1) * dim];
     let first = draw(weights, rng);
     let mut centres = row(first).to_vec();
-    let mut distance: Vec<f64> = (0..n).map(|i| squared_distance(row(i), row(first))).collect();
+    let mut distance: Vec<f64> = (0..n)
+        .map(|i| squared_distance(row(i), row(first)))
+        .collect();
     let n_trials = 2 + (k as f64).ln() as usize;
     while centres.len() < k * dim {
         let chances: Vec<f64> = distance.iter().zip(weights).map(|(d, w)| d * w).collect();
         let mut best: Option<(f64, usize, Vec<f64>)> = None;
         for _ in 0..n_trials {
             let candidate = draw(&chances, rng);
-            let closer: Vec<f64> =
-                (0..n).map(|i| distance[i].min(squared_distance(row(i), row(candidate)))).collect();
+            let closer: Vec<f64> = (0..n)
+                .map(|i| distance[i].min(squared_distance(row(i), row(candidate))))
+                .collect();
             let cost: f64 = closer.iter().zip(weights).map(|(d, w)| d * w).sum();
             if best.as_ref().is_none_or(|(least, ..)| cost < *least) {
                 best = Some((cost, candidate, closer));
             }
         }
-        let Some((_, chosen, closer)) = best else { unreachable!("at least two trials") };
+        let Some((_, chosen, closer)) = best else {
+            unreachable!("at least two trials")
+        };
         centres.extend_from_slice(row(chosen));
         distance = closer;
     }
@@ -105,13 +117,18 @@ fn lloyd(points: &[f64], dim: usize, weights: &[f64], mut centres: Vec<f64>) -> 
         for i in 0..n {
             let c = labels[i] as usize;
             mass[c] += weights[i];
-            for (s, x) in centres[c * dim..(c + 1) * dim].iter_mut().zip(&points[i * dim..(i + 1) * dim]) {
+            for (s, x) in centres[c * dim..(c + 1) * dim]
+                .iter_mut()
+                .zip(&points[i * dim..(i + 1) * dim])
+            {
                 *s += weights[i] * x;
             }
         }
         for c in 0..k {
             if mass[c] > 0.0 {
-                centres[c * dim..(c + 1) * dim].iter_mut().for_each(|s| *s /= mass[c]);
+                centres[c * dim..(c + 1) * dim]
+                    .iter_mut()
+                    .for_each(|s| *s /= mass[c]);
             } else {
                 let i = farthest.1;
                 centres[c * dim..(c + 1) * dim].copy_from_slice(&points[i * dim..(i + 1) * dim]);

@@ -21,7 +21,9 @@ pub fn largest_eigenpairs(matrix: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f
     let mut basis: Vec<DVector<f64>> = Vec::with_capacity(max_steps);
     let (mut alpha, mut beta): (Vec<f64>, Vec<f64>) = (Vec::new(), Vec::new());
     // A linear congruence as perturbation: no eigenvector of interest is orthogonal to it.
-    let mut v = DVector::from_fn(n, |i, _| 1.0 + 0.1 * (((i * 7919 + 13) % 1009) as f64 / 1009.0 - 0.5));
+    let mut v = DVector::from_fn(n, |i, _| {
+        1.0 + 0.1 * (((i * 7919 + 13) % 1009) as f64 / 1009.0 - 0.5)
+    });
     v /= v.norm();
     loop {
         let mut w = product(matrix, &v);
@@ -47,7 +49,9 @@ pub fn largest_eigenpairs(matrix: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f
             }
             let ritz = SymmetricEigen::new(t);
             let order = descending(&ritz.eigenvalues, k);
-            let converged = order.iter().all(|&j| (norm * ritz.eigenvectors[(m - 1, j)]).abs() < TOLERANCE);
+            let converged = order
+                .iter()
+                .all(|&j| (norm * ritz.eigenvectors[(m - 1, j)]).abs() < TOLERANCE);
             if done || converged {
                 let q = DMatrix::from_columns(&basis);
                 return select(ritz, k, Some(&q));
@@ -61,7 +65,9 @@ pub fn largest_eigenpairs(matrix: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f
 fn product(matrix: &CsMat<f64>, x: &DVector<f64>) -> DVector<f64> {
     DVector::from_iterator(
         matrix.rows(),
-        matrix.outer_iterator().map(|row| row.iter().map(|(j, a)| a * x[j]).sum::<f64>()),
+        matrix
+            .outer_iterator()
+            .map(|row| row.iter().map(|(j, a)| a * x[j]).sum::<f64>()),
     )
 }
 
@@ -86,15 +92,25 @@ fn select(
     basis: Option<&DMatrix<f64>>,
 ) -> (Vec<f64>, DMatrix<f64>) {
     let order = descending(&eigen.eigenvalues, k);
-    let chosen = DMatrix::from_columns(&order.iter().map(|&j| eigen.eigenvectors.column(j)).collect::<Vec<_>>());
+    let chosen = DMatrix::from_columns(
+        &order
+            .iter()
+            .map(|&j| eigen.eigenvectors.column(j))
+            .collect::<Vec<_>>(),
+    );
     let mut vectors = basis.map_or(chosen.clone(), |q| q * &chosen);
     for mut column in vectors.column_iter_mut() {
-        let largest = column.iter().fold(0.0f64, |m, x| if x.abs() > m.abs() { *x } else { m });
+        let largest = column
+            .iter()
+            .fold(0.0f64, |m, x| if x.abs() > m.abs() { *x } else { m });
         if largest < 0.0 {
             column.neg_mut();
         }
     }
-    (order.iter().map(|&j| eigen.eigenvalues[j]).collect(), vectors)
+    (
+        order.iter().map(|&j| eigen.eigenvalues[j]).collect(),
+        vectors,
+    )
 }
 
 #[cfg(test)]

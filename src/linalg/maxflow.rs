@@ -18,7 +18,13 @@ const NONE: u32 = u32::MAX;
 impl Network {
     /// A network of `n` nodes and no arcs.
     pub fn new(n: usize) -> Self {
-        Self { residual: Vec::new(), head: Vec::new(), first: vec![NONE; n + 2], next: Vec::new(), n }
+        Self {
+            residual: Vec::new(),
+            head: Vec::new(),
+            first: vec![NONE; n + 2],
+            next: Vec::new(),
+            n,
+        }
     }
 
     fn source(&self) -> usize {
@@ -108,7 +114,11 @@ impl Network {
                 arc[v] = self.next[a as usize];
             }
         }
-        let flow = path.iter().map(|a| self.residual[*a as usize]).min().unwrap_or(0);
+        let flow = path
+            .iter()
+            .map(|a| self.residual[*a as usize])
+            .min()
+            .unwrap_or(0);
         for a in path {
             self.residual[a as usize] -= flow;
             self.residual[a as usize ^ 1] += flow;
@@ -140,8 +150,9 @@ mod tests {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(3);
         for round in 0..300 {
             let n = rng.random_range(1..=9usize);
-            let terminals: Vec<_> =
-                (0..n).map(|_| (rng.random_range(0..20i64), rng.random_range(0..20i64))).collect();
+            let terminals: Vec<_> = (0..n)
+                .map(|_| (rng.random_range(0..20i64), rng.random_range(0..20i64)))
+                .collect();
             let edges: Vec<_> = (0..2 * n)
                 .map(|_| {
                     let (a, b) = (rng.random_range(0..n), rng.random_range(0..n));
@@ -158,7 +169,13 @@ mod tests {
             }
             let found = cost(&network.sink_side(), &terminals, &edges);
             let least = (0..1usize << n)
-                .map(|m| cost(&(0..n).map(|v| m >> v & 1 == 1).collect::<Vec<_>>(), &terminals, &edges))
+                .map(|m| {
+                    cost(
+                        &(0..n).map(|v| m >> v & 1 == 1).collect::<Vec<_>>(),
+                        &terminals,
+                        &edges,
+                    )
+                })
                 .min();
             assert_eq!(Some(found), least, "round {round}");
         }

@@ -18,8 +18,10 @@ pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
     let n_targets = targets.len() / dim;
     assert!(n_targets > 0, "nearest_rows needs at least one target");
     let n_queries = queries.len() / dim;
-    let half_norms: Vec<f32> =
-        targets.chunks_exact(dim).map(|t| 0.5 * t.iter().map(|x| x * x).sum::<f32>()).collect();
+    let half_norms: Vec<f32> = targets
+        .chunks_exact(dim)
+        .map(|t| 0.5 * t.iter().map(|x| x * x).sum::<f32>())
+        .collect();
     let mut nearest = vec![0u32; n_queries];
     let mut best = vec![f32::INFINITY; n_queries];
     // Column q of the product holds query q against a block of targets: contiguous for the scan.
@@ -31,10 +33,19 @@ pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
             let nt = BLOCK.min(n_targets - t0);
             let t = MatRef::from_row_major_slice(&targets[t0 * dim..(t0 + nt) * dim], nt, dim);
             let mut block = product.as_mut().submatrix_mut(0, 0, nt, nq);
-            matmul(block.as_mut(), Accum::Replace, t, q.transpose(), 1.0f32, Par::Seq);
+            matmul(
+                block.as_mut(),
+                Accum::Replace,
+                t,
+                q.transpose(),
+                1.0f32,
+                Par::Seq,
+            );
             for j in 0..nq {
                 let column = block.as_ref().col(j);
-                let Some(column) = column.try_as_col_major() else { unreachable!("owned columns") };
+                let Some(column) = column.try_as_col_major() else {
+                    unreachable!("owned columns")
+                };
                 let (at, value) = least(column.as_slice(), &half_norms[t0..t0 + nt]);
                 if value < best[q0 + j] {
                     best[q0 + j] = value;
@@ -90,10 +101,15 @@ mod tests {
             let found = nearest_rows(&queries, &targets, dim);
             for (i, &f) in found.iter().enumerate() {
                 let distance = |j: usize| -> f32 {
-                    (0..dim).map(|c| (queries[i * dim + c] - targets[j * dim + c]).powi(2)).sum()
+                    (0..dim)
+                        .map(|c| (queries[i * dim + c] - targets[j * dim + c]).powi(2))
+                        .sum()
                 };
                 let least = (0..t).map(distance).fold(f32::INFINITY, f32::min);
-                assert!(distance(f as usize) <= least + 1e-4, "row {i} of {q}x{t}x{dim}");
+                assert!(
+                    distance(f as usize) <= least + 1e-4,
+                    "row {i} of {q}x{t}x{dim}"
+                );
             }
         }
     }

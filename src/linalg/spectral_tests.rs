@@ -60,10 +60,10 @@ fn products_of_panels_are_those_of_plain_loops() {
             assert_eq!(tiles.len(), 2);
             assert_eq!(gram(&panels[2], &w), tiles[1]);
             for (tile, v) in tiles.iter().zip(&panels[1..]) {
-                for i in 0..WIDTH {
-                    for j in 0..WIDTH {
+                for (i, row) in tile.iter().enumerate() {
+                    for (j, found) in row.0.iter().enumerate() {
                         let plain: f64 = v.iter().zip(&w).map(|(a, b)| a.0[i] * b.0[j]).sum();
-                        assert!((tile[i].0[j] - plain).abs() < ROUNDING * n as f64);
+                        assert!((found - plain).abs() < ROUNDING * n as f64);
                     }
                 }
             }

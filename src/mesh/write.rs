@@ -23,8 +23,8 @@ pub fn off(mesh: &TriMesh) -> String {
     out
 }
 
-/// Wavefront OBJ text: a group and a material `label_N` (`unlabelled` below 0) for every run of polygons of
-/// one label. `material_file`: the name of a file with the text of [`mtl`].
+/// Wavefront OBJ text: a group and a material, named by `name`, for every run of polygons of one label.
+/// `material_file` is the name of a file with the text of [`mtl`].
 ///
 /// # Panics
 ///
@@ -33,13 +33,12 @@ pub fn obj<P: AsRef<[u32]>>(
     vertices: &[[f64; 3]],
     polygons: &[P],
     labels: &[i32],
-    material_file: Option<&str>,
+    name: impl Fn(i32) -> String,
+    material_file: &str,
 ) -> String {
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
     let mut out = String::with_capacity(60 * vertices.len() + 20 * polygons.len());
-    if let Some(name) = material_file {
-        line(&mut out, format_args!("mtllib {name}"));
-    }
+    line(&mut out, format_args!("mtllib {material_file}"));
     for [x, y, z] in vertices {
         line(&mut out, format_args!("v {x} {y} {z}"));
     }
@@ -47,11 +46,8 @@ pub fn obj<P: AsRef<[u32]>>(
     for (polygon, &label) in polygons.iter().zip(labels) {
         if current != Some(label) {
             current = Some(label);
-            let name = material(label);
-            line(&mut out, format_args!("g {name}"));
-            if material_file.is_some() {
-                line(&mut out, format_args!("usemtl {name}"));
-            }
+            let name = name(label);
+            line(&mut out, format_args!("g {name}\nusemtl {name}"));
         }
         out.push('f');
         for corner in polygon.as_ref() {
@@ -63,23 +59,17 @@ pub fn obj<P: AsRef<[u32]>>(
     out
 }
 
-/// The materials [`obj`] names, as MTL text: one diffuse sRGB colour per label.
-pub fn mtl(colours: &[(i32, [u8; 3])]) -> String {
+/// Materials for [`obj`], as MTL text: a name and a diffuse sRGB colour each.
+pub fn mtl(materials: &[(String, [u8; 3])]) -> String {
     let mut out = String::new();
-    for (label, colour) in colours {
+    for (name, colour) in materials {
         let [r, g, b] = colour.map(|c| f64::from(c) / 255.0);
-        line(&mut out, format_args!("newmtl {}", material(*label)));
-        line(&mut out, format_args!("Kd {r:.4} {g:.4} {b:.4}"));
+        line(
+            &mut out,
+            format_args!("newmtl {name}\nKd {r:.4} {g:.4} {b:.4}"),
+        );
     }
     out
-}
-
-fn material(label: i32) -> String {
-    if label < 0 {
-        "unlabelled".to_owned()
-    } else {
-        format!("label_{label}")
-    }
 }
 
 /// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and `int label`.
@@ -177,7 +167,8 @@ mod tests {
     fn obj_keeps_the_order_and_groups_runs() {
         let mesh = two_triangles();
         let polygons = [vec![0, 1, 2], vec![2, 1, 3], vec![0, 1, 3, 2]];
-        let text = obj(&mesh.vertices, &polygons, &[4, 4, -1], Some("a.mtl"));
+        let name = |label: i32| format!("label_{label}");
+        let text = obj(&mesh.vertices, &polygons, &[4, 4, -1], name, "a.mtl");
         let rest: Vec<&str> = text.lines().filter(|l| !l.starts_with("v ")).collect();
         let expected = [
             "mtllib a.mtl",
@@ -185,16 +176,14 @@ mod tests {
             "usemtl label_4",
             "f 1 2 3",
             "f 3 2 4",
-            "g unlabelled",
-            "usemtl unlabelled",
+            "g label_-1",
+            "usemtl label_-1",
             "f 1 2 4 3",
         ];
         assert_eq!(rest, expected);
-        assert_eq!(
-            mtl(&[(4, [255, 0, 51])]),
-            "newmtl label_4\nKd 1.0000 0.0000 0.2000\n"
-        );
-        assert!(!obj(&mesh.vertices, &mesh.faces, &[0, 1], None).contains("mtl"));
+        let materials = [("a".to_owned(), [255, 0, 51]), ("b".to_owned(), [0; 3])];
+        let expected = "newmtl a\nKd 1.0000 0.0000 0.2000\nnewmtl b\nKd 0.0000 0.0000 0.0000\n";
+        assert_eq!(mtl(&materials), expected);
     }
 
     #[test]

@@ -95,9 +95,7 @@ pub enum LaplacianError {
         weight: f64,
     },
     /// A bridge names a vertex that does not exist.
-    #[error(
-        "bridge {bridge} joins vertices {vertices:?}, but there are only {n_vertices}"
-    )]
+    #[error("bridge {bridge} joins vertices {vertices:?}, but there are only {n_vertices}")]
     Bridge {
         /// Which bridge.
         bridge: usize,

@@ -13,7 +13,7 @@ pub const ALGORITHM_VERSION: u32 = 1;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
-pub const MAX_EIGENVECTORS: usize = 100;
+const MAX_EIGENVECTORS: usize = 100;
 /// Eigenpairs on meshes so small that a quarter of their vertices is fewer.
 const MIN_EIGENPAIRS: usize = 4;
 /// Patches of the over-segmentation.
@@ -55,7 +55,13 @@ pub fn describe(
     params: &Params,
     stage: &dyn Fn(&str) -> bool,
 ) -> Result<Description, DescribeError> {
-    let enter = |name: &'static str| if stage(name) { Ok(()) } else { Err(DescribeError::Cancelled(name)) };
+    let enter = |name: &'static str| {
+        if stage(name) {
+            Ok(())
+        } else {
+            Err(DescribeError::Cancelled(name))
+        }
+    };
     enter("parse")?;
     let parsed = mesh::parse(bytes, format)?;
     enter("clean")?;
@@ -63,9 +69,16 @@ pub fn describe(
     enter("proxy")?;
     let proxy = mesh::proxy(&cleaned.mesh, params.working_faces);
     // What is stored is f32: everything below is computed from exactly that.
-    let vertices: Vec<[f32; 3]> = proxy.mesh.vertices.iter().map(|v| v.map(|x| x as f32)).collect();
-    let proxy_mesh =
-        TriMesh { vertices: vertices.iter().map(|v| v.map(f64::from)).collect(), faces: proxy.mesh.faces };
+    let vertices: Vec<[f32; 3]> = proxy
+        .mesh
+        .vertices
+        .iter()
+        .map(|v| v.map(|x| x as f32))
+        .collect();
+    let proxy_mesh = TriMesh {
+        vertices: vertices.iter().map(|v| v.map(f64::from)).collect(),
+        faces: proxy.mesh.faces,
+    };
     let bridges = mesh::bridges(&proxy_mesh);
     let found = spectrum_of(&proxy_mesh, &bridges, params, stage)?;
     enter("descriptors")?;
@@ -78,8 +91,11 @@ pub fn describe(
     let patches = patches(&proxy_mesh, &dual, face.farthest_start, N_PATCHES);
     let signature = descriptors::signature(&proxy_mesh, &face, values);
 
-    let face_map: Vec<u32> =
-        cleaned.face_of_polygon.iter().map(|f| proxy.face_map[*f as usize]).collect();
+    let face_map: Vec<u32> = cleaned
+        .face_of_polygon
+        .iter()
+        .map(|f| proxy.face_map[*f as usize])
+        .collect();
     let mut report = cleaned.report;
     report.n_proxy_faces = proxy_mesh.faces.len();
     report.n_proxy_vertices = vertices.len();
@@ -134,7 +150,10 @@ pub fn spectrum_of(
         k = k.min(n / 4).max(MIN_EIGENPAIRS.min(n));
     }
     let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)?;
-    Ok(MeshSpectrum { spectrum, mass: operator.mass })
+    Ok(MeshSpectrum {
+        spectrum,
+        mass: operator.mass,
+    })
 }
 
 /// The first `n` columns, row-major, in single precision.

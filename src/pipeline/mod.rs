@@ -5,7 +5,9 @@ mod place;
 mod recluster;
 
 pub use crate::description::{Description, DescriptionView, Params};
-pub use describe::{ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of};
+pub use describe::{
+    ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of,
+};
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
     LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, recluster,

@@ -31,9 +31,15 @@ impl Prepared {
     /// Prepares a shape.
     pub fn new(shape: &DescriptionView<'_>, model: &LabelModel) -> Self {
         let surface = Surface::new(&shape.mesh());
-        let features = model.normalisation.standardise(&Features::raw(shape, model.up));
+        let features = model
+            .normalisation
+            .standardise(&Features::raw(shape, model.up));
         let at_vertices = features.at_vertices(shape.vertices.len(), shape.faces, &surface.area);
-        Self { surface, features, at_vertices }
+        Self {
+            surface,
+            features,
+            at_vertices,
+        }
     }
 
     fn map_shape<'a>(&'a self, shape: &DescriptionView<'a>) -> MapShape<'a> {
@@ -91,13 +97,20 @@ impl Labelling {
                 ((0.5 * cut + 0.5 * p) * 255.0).round() as u8
             })
             .collect();
-        Self { classes, probabilities, weights }
+        Self {
+            classes,
+            probabilities,
+            weights,
+        }
     }
 
     /// A labelling that is given, with the label model's opinion as evidence.
     pub fn given(classes: Vec<u32>, prepared: &Prepared, model: &LabelModel) -> Self {
         let k = model.labels.len();
-        let log = model.statistics.classifier().log_probabilities(&prepared.features);
+        let log = model
+            .statistics
+            .classifier()
+            .log_probabilities(&prepared.features);
         let posterior: Vec<f64> = log.iter().map(|p| p.exp()).collect();
         Self::new(classes, &posterior, Vec::new(), k)
     }
@@ -110,9 +123,17 @@ impl Labelling {
 }
 
 /// Labels a shape from votes and the label model: a vote and a cut, no spectrum, no new map.
-pub fn label(shape: &DescriptionView<'_>, prepared: &Prepared, model: &LabelModel, votes: &[Vote<'_>]) -> Labelling {
+pub fn label(
+    shape: &DescriptionView<'_>,
+    prepared: &Prepared,
+    model: &LabelModel,
+    votes: &[Vote<'_>],
+) -> Labelling {
     let k = model.labels.len();
-    let log_model = model.statistics.classifier().log_probabilities(&prepared.features);
+    let log_model = model
+        .statistics
+        .classifier()
+        .log_probabilities(&prepared.features);
     let (carried, weights) = carried(shape, votes, k);
     let mut unary = Vec::with_capacity(log_model.len());
     for (i, log) in log_model.iter().enumerate() {
@@ -136,8 +157,10 @@ fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f6
     let Some(least) = votes.iter().map(|v| v.residual).min_by(f64::total_cmp) else {
         return (Vec::new(), Vec::new());
     };
-    let mut weights: Vec<f64> =
-        votes.iter().map(|v| (-(v.residual - least) / (RESIDUAL_SCALE * least + 1e-9)).exp()).collect();
+    let mut weights: Vec<f64> = votes
+        .iter()
+        .map(|v| (-(v.residual - least) / (RESIDUAL_SCALE * least + 1e-9)).exp())
+        .collect();
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum);
     let mut at_vertices = vec![0.0; shape.vertices.len() * k];
@@ -153,7 +176,12 @@ fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f6
     let mut faces = Vec::with_capacity(shape.faces.len() * k);
     for face in shape.faces {
         for l in 0..k {
-            faces.push(face.iter().map(|v| at_vertices[*v as usize * k + l]).sum::<f64>() / 3.0);
+            faces.push(
+                face.iter()
+                    .map(|v| at_vertices[*v as usize * k + l])
+                    .sum::<f64>()
+                    / 3.0,
+            );
         }
     }
     (faces, weights)
@@ -161,7 +189,12 @@ fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f6
 
 /// Probabilities at the vertices of a known shape: means over the faces around each.
 fn vertex_probabilities(vote: &Vote<'_>, k: usize) -> Vec<f64> {
-    let n = vote.faces.iter().flatten().max().map_or(0, |v| *v as usize + 1);
+    let n = vote
+        .faces
+        .iter()
+        .flatten()
+        .max()
+        .map_or(0, |v| *v as usize + 1);
     let mut sum = vec![0.0; n * k];
     for (f, face) in vote.faces.iter().enumerate() {
         for v in face {

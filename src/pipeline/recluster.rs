@@ -3,8 +3,8 @@
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
-    Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation, ShapeInput, Statistics,
-    discover, labelling_score,
+    Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation, ShapeInput,
+    Statistics, discover, labelling_score,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -78,8 +78,14 @@ pub fn recluster(
     epoch: u64,
     options: &ReclusterOptions,
 ) -> Reclustering {
-    let raw: Vec<Features> = shapes.iter().map(|s| Features::raw(&s.shape, options.up)).collect();
-    let surfaces: Vec<Surface> = shapes.iter().map(|s| Surface::new(&s.shape.mesh())).collect();
+    let raw: Vec<Features> = shapes
+        .iter()
+        .map(|s| Features::raw(&s.shape, options.up))
+        .collect();
+    let surfaces: Vec<Surface> = shapes
+        .iter()
+        .map(|s| Surface::new(&s.shape.mesh()))
+        .collect();
     let normalisation = Normalisation::fit(
         raw.iter().zip(surfaces.iter().map(|s| s.area.as_slice())),
         options.up.is_some(),
@@ -93,13 +99,20 @@ pub fn recluster(
             at_vertices: Vec::new(),
         })
         .collect();
-    let patches: Vec<PatchGraph> =
-        prepared.iter().zip(shapes).map(|(p, s)| PatchGraph::new(&p.surface, s.shape.patches)).collect();
+    let patches: Vec<PatchGraph> = prepared
+        .iter()
+        .zip(shapes)
+        .map(|(p, s)| PatchGraph::new(&p.surface, s.shape.patches))
+        .collect();
     let input = DiscoveryInput {
         shapes: prepared
             .iter()
             .zip(&patches)
-            .map(|(p, patches)| ShapeInput { surface: &p.surface, patches, features: &p.features })
+            .map(|(p, patches)| ShapeInput {
+                surface: &p.surface,
+                patches,
+                features: &p.features,
+            })
             .collect(),
         up_known: options.up.is_some(),
     };
@@ -114,7 +127,12 @@ pub fn recluster(
     let accepted = options.always || new_score > old_score + MIN_GAIN;
     let (labels, classes, changes) = match (accepted, current, old) {
         (false, Some(classes), Some(model)) => (model.labels.clone(), classes, Vec::new()),
-        (_, current, old) => rename(found, current.as_deref().zip(old), &prepared, options.next_label),
+        (_, current, old) => rename(
+            found,
+            current.as_deref().zip(old),
+            &prepared,
+            options.next_label,
+        ),
     };
     let dim = normalisation.mean.len();
     let mut statistics = Statistics::empty(labels.len(), dim);
@@ -123,16 +141,34 @@ pub fn recluster(
         let of_shape = Statistics::of_shape(&p.features, &p.surface.area, class, labels.len());
         statistics.accumulate(&of_shape, 1.0);
     }
-    let model = LabelModel { epoch, labels, normalisation, statistics, up: options.up };
-    let labellings =
-        classes.into_iter().zip(&prepared).map(|(c, p)| Labelling::given(c, p, &model)).collect();
-    Reclustering { scores: (old_score, new_score), accepted, changes, model, labellings }
+    let model = LabelModel {
+        epoch,
+        labels,
+        normalisation,
+        statistics,
+        up: options.up,
+    };
+    let labellings = classes
+        .into_iter()
+        .zip(&prepared)
+        .map(|(c, p)| Labelling::given(c, p, &model))
+        .collect();
+    Reclustering {
+        scores: (old_score, new_score),
+        accepted,
+        changes,
+        model,
+        labellings,
+    }
 }
 
 /// The classes of the old model that the representatives' labels are.
 fn current_classes(shapes: &[Representative<'_>], model: &LabelModel) -> Vec<Vec<u32>> {
     let class_of = |label: &u32| model.labels.iter().position(|l| l == label).unwrap_or(0) as u32;
-    shapes.iter().map(|s| s.labels.iter().map(class_of).collect()).collect()
+    shapes
+        .iter()
+        .map(|s| s.labels.iter().map(class_of).collect())
+        .collect()
 }
 
 type Renamed = (Vec<u32>, Vec<Vec<u32>>, Vec<LabelChange>);
@@ -166,9 +202,14 @@ fn rename(
             Some(old) => model.labels[*old],
             None => {
                 let row = &overlap[class * k_old..(class + 1) * k_old];
-                let from = (0..k_old).max_by(|&a, &b| row[a].total_cmp(&row[b])).unwrap_or(0);
+                let from = (0..k_old)
+                    .max_by(|&a, &b| row[a].total_cmp(&row[b]))
+                    .unwrap_or(0);
                 changes.push(LabelChange::Created(next));
-                changes.push(LabelChange::Split { from: model.labels[from], into: next });
+                changes.push(LabelChange::Split {
+                    from: model.labels[from],
+                    into: next,
+                });
                 next += 1;
                 next - 1
             }
@@ -178,7 +219,10 @@ fn rename(
         let into = (0..k)
             .max_by(|&a, &b| overlap[a * k_old + old].total_cmp(&overlap[b * k_old + old]))
             .unwrap_or(0);
-        changes.push(LabelChange::Merged { from: model.labels[old], into: labels[into] });
+        changes.push(LabelChange::Merged {
+            from: model.labels[old],
+            into: labels[into],
+        });
     }
     (labels, found.labels, changes)
 }

@@ -17,7 +17,10 @@ struct Merge {
 impl Ord for Merge {
     fn cmp(&self, other: &Self) -> Ordering {
         // BinaryHeap is a max-heap: the cheapest merge, then the lowest pair, comes first.
-        other.cost.total_cmp(&self.cost).then_with(|| other.pair.cmp(&self.pair))
+        other
+            .cost
+            .total_cmp(&self.cost)
+            .then_with(|| other.pair.cmp(&self.pair))
     }
 }
 impl PartialOrd for Merge {
@@ -38,7 +41,12 @@ impl Eq for Merge {}
 /// The cost of a merge is Ward's (descriptor difference of `means (n_patches, dim)` weighted by area),
 /// times `exp(crease / 0.05)`, over the length of the common boundary relative to the smaller side.
 /// Where patches do not touch, more regions than asked for are left.
-pub fn merge_patches(graph: &PatchGraph, means: &[f64], dim: usize, sizes: &[usize]) -> Vec<Vec<u32>> {
+pub fn merge_patches(
+    graph: &PatchGraph,
+    means: &[f64],
+    dim: usize,
+    sizes: &[usize],
+) -> Vec<Vec<u32>> {
     let n = graph.len();
     let mut area = graph.area.clone();
     let mut mean: Vec<Vec<f64>> = means.chunks_exact(dim).map(<[f64]>::to_vec).collect();
@@ -49,17 +57,26 @@ pub fn merge_patches(graph: &PatchGraph, means: &[f64], dim: usize, sizes: &[usi
     }
     let mut region: Vec<u32> = (0..n as u32).collect();
     let mut version = vec![0u32; n];
-    let cost = |area: &[f64], mean: &[Vec<f64>], i: usize, j: usize, (length, weighted): (f64, f64)| {
-        let difference: f64 = mean[i].iter().zip(&mean[j]).map(|(a, b)| (a - b) * (a - b)).sum();
-        let ward = area[i] * area[j] / (area[i] + area[j]).max(1e-300) * difference;
-        let relative_length = length / area[i].min(area[j]).sqrt().max(1e-12);
-        ward * (weighted / length.max(1e-300) / CREASE_SCALE).exp() / relative_length.max(1e-12)
-    };
+    let cost =
+        |area: &[f64], mean: &[Vec<f64>], i: usize, j: usize, (length, weighted): (f64, f64)| {
+            let difference: f64 = mean[i]
+                .iter()
+                .zip(&mean[j])
+                .map(|(a, b)| (a - b) * (a - b))
+                .sum();
+            let ward = area[i] * area[j] / (area[i] + area[j]).max(1e-300) * difference;
+            let relative_length = length / area[i].min(area[j]).sqrt().max(1e-12);
+            ward * (weighted / length.max(1e-300) / CREASE_SCALE).exp() / relative_length.max(1e-12)
+        };
     let mut heap = BinaryHeap::new();
     for (i, neighbours) in around.iter().enumerate() {
         for (&j, &boundary) in neighbours.range(i as u32 + 1..) {
             let pair = [i as u32, j];
-            heap.push(Merge { cost: cost(&area, &mean, i, j as usize, boundary), pair, versions: [0, 0] });
+            heap.push(Merge {
+                cost: cost(&area, &mean, i, j as usize, boundary),
+                pair,
+                versions: [0, 0],
+            });
         }
     }
     let mut alive = n;
@@ -77,14 +94,18 @@ pub fn merge_patches(graph: &PatchGraph, means: &[f64], dim: usize, sizes: &[usi
             continue;
         }
         let sum = area[i] + area[j];
-        for c in 0..dim {
-            mean[i][c] = (area[i] * mean[i][c] + area[j] * mean[j][c]) / sum.max(1e-300);
+        let merged = std::mem::take(&mut mean[j]);
+        for (m, other) in mean[i].iter_mut().zip(&merged) {
+            *m = (area[i] * *m + area[j] * other) / sum.max(1e-300);
         }
         area[i] = sum;
         version[i] += 1;
         dead[j] = true;
         alive -= 1;
-        region.iter_mut().filter(|r| **r == j as u32).for_each(|r| *r = i as u32);
+        region
+            .iter_mut()
+            .filter(|r| **r == j as u32)
+            .for_each(|r| *r = i as u32);
         around[i].remove(&(j as u32));
         for (q, (length, weighted)) in std::mem::take(&mut around[j]) {
             around[q as usize].remove(&(j as u32));
@@ -101,14 +122,21 @@ pub fn merge_patches(graph: &PatchGraph, means: &[f64], dim: usize, sizes: &[usi
             let pair = [(i as u32).min(q), (i as u32).max(q)];
             let [a, b] = pair.map(|p| p as usize);
             let cost = cost(&area, &mean, a, b, boundary);
-            heap.push(Merge { cost, pair, versions: [version[a], version[b]] });
+            heap.push(Merge {
+                cost,
+                pair,
+                versions: [version[a], version[b]],
+            });
         }
     }
     sizes
         .iter()
         .map(|n| {
             // Too few merges possible: the coarsest there is; too few patches: the patches themselves.
-            let at_least = snapshots.range(n..).next().or_else(|| snapshots.iter().next_back());
+            let at_least = snapshots
+                .range(n..)
+                .next()
+                .or_else(|| snapshots.iter().next_back());
             at_least.map(|(_, s)| s.clone()).unwrap_or_default()
         })
         .collect()
@@ -155,8 +183,11 @@ impl PartGraph {
         dim: usize,
     ) -> Self {
         let n = part_of_patch.iter().max().map_or(0, |p| *p as usize + 1);
-        let part_of_face: Vec<u32> =
-            patches.patch_of_face.iter().map(|p| part_of_patch[*p as usize]).collect();
+        let part_of_face: Vec<u32> = patches
+            .patch_of_face
+            .iter()
+            .map(|p| part_of_patch[*p as usize])
+            .collect();
         let mut area = vec![0.0; n];
         for (p, a) in part_of_patch.iter().zip(&patches.area) {
             area[*p as usize] += a;
@@ -170,7 +201,10 @@ impl PartGraph {
         let mut boundary = vec![0.0; n * n];
         let mut creased = vec![0.0; n * n];
         for &([a, b], length, crease) in &patches.edges {
-            let (p, q) = (part_of_patch[a as usize] as usize, part_of_patch[b as usize] as usize);
+            let (p, q) = (
+                part_of_patch[a as usize] as usize,
+                part_of_patch[b as usize] as usize,
+            );
             if p != q {
                 for at in [p * n + q, q * n + p] {
                     boundary[at] += length;
@@ -211,7 +245,15 @@ impl PartGraph {
                 log_area_around,
             ]);
         }
-        Self { area, mean, spread, context, shape, boundary, creased }
+        Self {
+            area,
+            mean,
+            spread,
+            context,
+            shape,
+            boundary,
+            creased,
+        }
     }
 
     /// Number of parts.
@@ -229,8 +271,8 @@ impl PartGraph {
 fn extents(surface: &Surface, part_of_face: &[u32], area: &[f64]) -> Vec<[f64; 3]> {
     let mut centre = vec![[0.0; 3]; area.len()];
     for (f, &p) in part_of_face.iter().enumerate() {
-        for c in 0..3 {
-            centre[p as usize][c] += surface.area[f] * surface.centroids[f][c];
+        for (sum, x) in centre[p as usize].iter_mut().zip(surface.centroids[f]) {
+            *sum += surface.area[f] * x;
         }
     }
     for (c, a) in centre.iter_mut().zip(area) {

@@ -62,7 +62,12 @@ impl Surface {
                 } else {
                     length / mean * -crease.clamp(1e-3, 1.0).ln() / 1000f64.ln()
                 };
-                SurfaceEdge { faces: e.faces, length, crease, boundary_cost }
+                SurfaceEdge {
+                    faces: e.faces,
+                    length,
+                    crease,
+                    boundary_cost,
+                }
             })
             .collect();
         Self {
@@ -78,13 +83,22 @@ impl Surface {
     }
 
     /// Area-weighted mean of the rows of `values (m, dim)` over each patch; `(n_patches, dim)`.
-    pub fn patch_means(&self, patches: &[u32], n_patches: usize, values: &[f32], dim: usize) -> Vec<f64> {
+    pub fn patch_means(
+        &self,
+        patches: &[u32],
+        n_patches: usize,
+        values: &[f32],
+        dim: usize,
+    ) -> Vec<f64> {
         let mut mean = vec![0.0; n_patches * dim];
         let mut area = vec![0.0; n_patches];
         for (face, &p) in patches.iter().enumerate() {
             let p = p as usize;
             area[p] += self.area[face];
-            for (s, &x) in mean[p * dim..(p + 1) * dim].iter_mut().zip(&values[face * dim..]) {
+            for (s, &x) in mean[p * dim..(p + 1) * dim]
+                .iter_mut()
+                .zip(&values[face * dim..])
+            {
                 *s += self.area[face] * f64::from(x);
             }
         }
@@ -127,7 +141,11 @@ impl PatchGraph {
             .into_iter()
             .map(|(pair, (length, weighted))| (pair, length, weighted / length.max(1e-300)))
             .collect();
-        Self { patch_of_face: patches.to_vec(), area, edges }
+        Self {
+            patch_of_face: patches.to_vec(),
+            area,
+            edges,
+        }
     }
 
     /// Number of patches.

@@ -45,6 +45,7 @@ fn help_tells_the_commands_and_the_exit_codes() {
         "check",
         "config",
         "synth",
+        "demo",
     ] {
         let at_start = |l: &str| l.trim_start().starts_with(command);
         assert!(text.lines().any(at_start), "{command}: {text}");
@@ -265,7 +266,8 @@ fn a_folder_becomes_labelled_shapes_and_files() {
         0,
     );
     assert_eq!(files["files"], serde_json::json!([format!("{out}/10.ply")]));
-    let ply = std::fs::read_to_string(format!("{out}/10.ply")).unwrap();
+    let ply = std::fs::read(format!("{out}/10.ply")).unwrap();
+    let ply = String::from_utf8_lossy(&ply);
     assert!(ply.contains(&format!("element face {SKITTLE_FACES}\n")));
     stdout(
         &home.coseg(&["export", "--format", "obj", "--out", &out]),
@@ -445,4 +447,33 @@ fn files_below(directory: &std::path::Path) -> Vec<std::path::PathBuf> {
     entries
         .flat_map(|p| if p.is_dir() { files_below(&p) } else { vec![p] })
         .collect()
+}
+
+#[test]
+fn the_demonstration_labels_a_family_and_leaves_meshes_to_look_at() {
+    let home = Home::new();
+    let out = home.path("demo").display().to_string();
+    let demo = ["demo", "pliers", "--count", "3", "--faces", "1000"];
+    let report = json(
+        &home.coseg(&[&demo[..], &["--out", &out, "--json"]].concat()),
+        0,
+    );
+    assert_eq!(report["shapes"].as_array().unwrap().len(), 3);
+    for shape in report["shapes"].as_array().unwrap() {
+        assert_eq!(shape["outcome"], "added");
+        assert!(shape["stages_ms"]["spectrum"].as_f64().unwrap() > 0.0);
+    }
+    // One label for everything would be right on about 0.6 of the area.
+    assert!(report["accuracy"].as_f64().unwrap() > 0.7, "{report}");
+    for name in ["pliers-001.ply", "pliers-003.ply", "all.ply"] {
+        assert!(exists(format!("{out}/{name}")), "{name}");
+    }
+    let words = stdout(
+        &home.coseg(&[&demo[..], &["--out", &out, "--rotate"]].concat()),
+        0,
+    );
+    assert!(
+        words.contains("pliers-003") && words.contains("ms: parse"),
+        "{words}"
+    );
 }

@@ -24,7 +24,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
             .disc(JOINT, axle, 0.5 * joint, 1.25 * flat + 0.03, 0.02);
     }
 
-    let open = dice.between(5.0, 24.0);
+    let open = dice.between(7.0, 24.0);
     let kind = dice.pick(3);
     let jaw = dice.between(0.26, 0.55);
     let handle = dice.between(0.6, 0.95);
@@ -39,16 +39,16 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         match kind {
             0 => {
                 // Needle nose.
-                limb.cone(JAW, at(0.06, 0.05), at(0.045, jaw), 1.1 * flat, 0.032);
+                limb.cone(JAW, at(0.085, 0.05), at(0.05, jaw), 1.1 * flat, 0.032);
             }
             1 => {
                 // Flat, broad.
                 let width = 0.9 * flat;
                 let outline = vec![
-                    [-side * 0.01, 0.0],
-                    [-side * (0.03 + 1.6 * width), 0.0],
-                    [-side * (0.03 + 1.2 * width), 0.8 * jaw],
-                    [-side * 0.035, 0.8 * jaw],
+                    [-side * 0.045, 0.0],
+                    [-side * (0.05 + 1.4 * width), 0.0],
+                    [-side * (0.05 + 1.0 * width), 0.8 * jaw],
+                    [-side * 0.045, 0.8 * jaw],
                 ];
                 let solid = Solid::Plate {
                     frame: lever,
