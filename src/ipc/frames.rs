@@ -97,7 +97,7 @@ impl AsRef<[u8]> for Received {
 }
 
 /// The frames of a message, or its first frames and why the rest was dropped.
-pub type Received = Result<Vec<Bytes>, (Vec<Bytes>, FrameError)>;
+pub type WholeMessage = Result<Vec<Bytes>, (Vec<Bytes>, FrameError)>;
 
 /// Receives all frames of one message. The outer error is the socket's; the inner one says that the
 /// message was too large and was dropped, with its first frames (at most `n_kept`) for an answer.
@@ -106,7 +106,7 @@ pub fn receive(
     flags: i32,
     limits: &FrameLimits,
     n_kept: usize,
-) -> Result<Received, zmq::Error> {
+) -> Result<WholeMessage, zmq::Error> {
     let mut frames = Vec::new();
     let mut excess = None;
     let (mut n_frames, mut n_bytes) = (0_usize, 0_u64);
