@@ -5,25 +5,33 @@
 //! number of known shapes and labels its faces (pure, serial per collection). [`Library`] commits the
 //! result: the one effect. The daemon is a shell around [`Library`].
 
+// In the order in which data flows: a module names only modules before it (tests/it/tidy.rs).
+
 // Pure: values in, values out.
-pub mod correspondence;
-pub mod descriptors;
-pub mod fmap;
-pub mod labels;
 pub mod linalg;
 pub mod mesh;
-pub mod neighbors;
 pub mod operators;
-pub mod pipeline;
-pub mod segmentation;
 pub mod spectrum;
+pub mod description;
+pub mod descriptors;
+pub mod segmentation;
+pub mod fmap;
+pub mod correspondence;
+pub mod labels;
+pub mod neighbors;
+pub mod pipeline;
 pub mod synth;
 
 // Shell: files, sockets, clocks.
+pub mod store;
+pub mod library;
+pub mod ipc;
 pub mod config;
 pub mod daemon;
-pub mod ipc;
-pub mod library;
-pub mod store;
 
 pub use library::Library;
+
+/// Runs the example of the README as a test.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

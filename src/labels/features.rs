@@ -1,7 +1,7 @@
 //! Face descriptors become comparable across a collection: standardised, clipped, weighted by group.
 
+use crate::description::DescriptionView;
 use crate::descriptors;
-use crate::pipeline::DescriptionView;
 
 /// Standardised values are clipped to this many standard deviations.
 const CLIP: f64 = 4.0;

@@ -1,1 +1,117 @@
-//! (being written)
+//! What the layout and the documents promise and the compiler does not check. Every check is itself
+//! checked on planted faults.
+
+mod code;
+mod docs;
+
+use crate::harness::coseg;
+use code::{Flow, code_faults};
+use docs::{commands_in, has_flag, link_faults};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Files below `dir` with the extension, with their paths from the root of the project, sorted.
+fn files(dir: &Path, extension: &str) -> Vec<(String, String)> {
+    let mut found = Vec::new();
+    let mut open = vec![dir.to_path_buf()];
+    while let Some(dir) = open.pop() {
+        for entry in fs::read_dir(&dir).unwrap() {
+            let path: PathBuf = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|e| e == extension) {
+                let name = path
+                    .strip_prefix(root())
+                    .unwrap()
+                    .to_str()
+                    .unwrap()
+                    .to_owned();
+                found.push((name, fs::read_to_string(&path).unwrap()));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+fn assert_none(faults: &[String]) {
+    assert!(faults.is_empty(), "\n{}", faults.join("\n"));
+}
+
+#[test]
+fn the_code_keeps_to_the_layout() {
+    let flow = Flow::read(&fs::read_to_string(root().join("src/lib.rs")).unwrap());
+    let mut faults = Vec::new();
+    for dir in ["src", "tests"] {
+        for (file, text) in files(&root().join(dir), "rs") {
+            faults.extend(code_faults(&flow, &file, &text));
+        }
+    }
+    assert_none(&faults);
+}
+
+#[test]
+fn the_order_of_modules_is_complete() {
+    let flow = Flow::read(&fs::read_to_string(root().join("src/lib.rs")).unwrap());
+    // Of the binary alone; no module of the library can name them.
+    let binary = ["main", "cli", "commands", "telemetry", "lib"];
+    let mut modules = Vec::new();
+    for entry in fs::read_dir(root().join("src")).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        if !binary.contains(&name.as_str()) && !modules.contains(&name) {
+            modules.push(name);
+        }
+    }
+    modules.sort();
+    let mut listed = flow.modules.clone();
+    listed.sort();
+    assert_eq!(listed, modules);
+    assert_eq!(flow.pure().first().map(String::as_str), Some("linalg"));
+    assert!(flow.pure().iter().any(|m| m == "pipeline"));
+}
+
+#[test]
+fn links_lead_somewhere() {
+    let mut faults = Vec::new();
+    let mut documents = files(&root().join("docs"), "md");
+    documents.push((
+        "README.md".into(),
+        fs::read_to_string(root().join("README.md")).unwrap(),
+    ));
+    for (file, text) in documents
+        .into_iter()
+        .chain(files(&root().join("src"), "rs"))
+    {
+        faults.extend(link_faults(root(), &file, &text));
+    }
+    assert_none(&faults);
+}
+
+/// What the README says to type is what the program takes.
+#[test]
+fn commands_of_the_readme_exist() {
+    let readme = fs::read_to_string(root().join("README.md")).unwrap();
+    let commands = commands_in(&readme);
+    assert!(
+        commands.len() >= 10,
+        "only {} commands in README.md",
+        commands.len()
+    );
+    let mut faults = Vec::new();
+    for (command, flags) in commands {
+        let help = coseg().args([&command, "--help"]).output().unwrap();
+        let help_text = String::from_utf8(help.stdout).unwrap();
+        if !help.status.success() {
+            faults.push(format!("README.md: there is no coseg {command}"));
+        }
+        for flag in flags.iter().filter(|f| !has_flag(&help_text, f)) {
+            faults.push(format!("README.md: coseg {command} has no {flag}"));
+        }
+    }
+    assert_none(&faults);
+}
