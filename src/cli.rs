@@ -1,5 +1,6 @@
 //! What was typed becomes one command with typed flags.
 
+use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -107,6 +108,8 @@ pub(crate) enum Command {
     Describe(Describe),
     /// Make a family of labelled shapes
     Synth(SynthArgs),
+    /// Run the main job on a made family, end to end, in a temporary library
+    Demo(DemoArgs),
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
     /// Check or show the daemon's configuration
