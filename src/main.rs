@@ -7,6 +7,10 @@ mod telemetry;
 use clap::Parser as _;
 use std::process::ExitCode;
 
+/// Gives memory back after bursts of work, where the system's allocator keeps it in its arenas.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> ExitCode {
     let cli = cli::Cli::parse();
     match commands::run(cli) {

@@ -13,6 +13,7 @@ mod features;
 mod joint;
 mod model;
 pub mod score;
+mod up;
 
 pub use boundary::refine_boundary;
 pub use discover::{
@@ -20,3 +21,4 @@ pub use discover::{
 };
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
+pub use up::estimate_up;

@@ -64,9 +64,9 @@ impl Lane {
         })
     }
 
-    /// The up axis, where the collection was given one.
-    pub(super) fn up(&self) -> Option<[f64; 3]> {
-        self.row.up.parse::<Up>().ok().and_then(Up::axis)
+    /// Which way is up, as the collection was created.
+    pub(super) fn up(&self) -> Up {
+        self.row.up.parse().unwrap_or_default()
     }
 
     /// Whether a shape's labels are part of the model of this epoch.

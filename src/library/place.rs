@@ -4,9 +4,9 @@ use super::commit::Commit;
 use super::lane::{KnownShape, Lane};
 use super::learnt::Learnt;
 use super::rows::{CollectionState, damaged};
-use super::{Described, Library, Outcome, Placed, Result, Source};
+use super::{Described, Library, Outcome, Placed, Result, Source, Up};
 use crate::fmap::{FunctionalMap, MapOptions};
-use crate::labels::DiscoveryOptions;
+use crate::labels::{DiscoveryOptions, estimate_up};
 use crate::pipeline::{
     DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote,
     label, map, recluster,
@@ -214,7 +214,10 @@ impl Library {
                 n_labels,
                 ..DiscoveryOptions::default()
             },
-            up: lane.up(),
+            up: match lane.up() {
+                Up::Auto => estimate_up(shapes.iter().map(|s| &s.shape)).map(|found| found.0),
+                given => given.axis(),
+            },
             always: shapes.len() <= TOO_FEW,
             next_label: lane.row.next_label,
         };

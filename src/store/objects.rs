@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Bytes of array files that stay mapped between uses, unless told otherwise.
-pub const DEFAULT_CACHE_BYTES: usize = 32 << 20;
+pub const DEFAULT_CACHE_BYTES: usize = 16 << 20;
 
 /// Orphans younger than this may belong to work that is under way.
 pub const ORPHAN_AGE: Duration = Duration::from_secs(24 * 60 * 60);

@@ -1,0 +1,172 @@
+//! Shapes of one class that share a frame become an estimate of which way is up.
+//!
+//! What stands has a wide base under its centre of mass (Fu, Cohen-Or, Dror and Sheffer 2008, *Upright Orientation
+//! of Man-Made Objects*). Each shape votes for the signed coordinate axis along which it stands best.
+
+use crate::description::DescriptionView;
+
+/// Share of the height that counts as the base.
+const BASE: f64 = 0.03;
+/// Worth of a base that the centre of mass is not above.
+const UNSTABLE: f64 = 0.2;
+/// Least share of the shapes that must agree; of six axes one gets a sixth by chance.
+const LEAST_AGREEMENT: f64 = 0.5;
+
+/// The unit vector that most shapes stand along, and the share of the shapes that agree; `None` where fewer than
+/// half do.
+pub fn estimate_up<'a>(
+    shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
+) -> Option<([f64; 3], f64)> {
+    let axes: [[f64; 3]; 6] = std::array::from_fn(|i| {
+        let mut axis = [0.0; 3];
+        axis[i / 2] = if i % 2 == 0 { 1.0 } else { -1.0 };
+        axis
+    });
+    let (mut votes, mut sums, mut n) = ([0usize; 6], [0.0; 6], 0usize);
+    for shape in shapes {
+        let scores = axes.map(|axis| standing(shape, axis));
+        let best = (0..6).max_by(|&a, &b| scores[a].total_cmp(&scores[b]).then(b.cmp(&a)))?;
+        votes[best] += 1;
+        n += 1;
+        for (sum, score) in sums.iter_mut().zip(scores) {
+            *sum += score;
+        }
+    }
+    let better = |a: &usize, b: &usize| {
+        votes[*a]
+            .cmp(&votes[*b])
+            .then(sums[*a].total_cmp(&sums[*b]))
+            .then(b.cmp(a))
+    };
+    let winner = (0..6).max_by(better)?;
+    let agreement = votes[winner] as f64 / n.max(1) as f64;
+    (n > 0 && agreement >= LEAST_AGREEMENT).then_some((axes[winner], agreement))
+}
+
+/// Area of the base's convex hull over that of the whole outline, seen from above; less where the centre of mass is
+/// not above the base.
+fn standing(shape: &DescriptionView<'_>, axis: [f64; 3]) -> f64 {
+    let k = (0..3).find(|c| axis[*c] != 0.0).unwrap_or(0);
+    let (u, v) = ((k + 1) % 3, (k + 2) % 3);
+    let height = |p: &[f32; 3]| axis[k] * f64::from(p[k]);
+    let flat = |p: &[f32; 3]| [f64::from(p[u]), f64::from(p[v])];
+    let heights: Vec<f64> = shape.vertices.iter().map(height).collect();
+    let low = heights.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = heights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let base_below = low + BASE * (high - low);
+    let all = hull(shape.vertices.iter().map(flat).collect());
+    let is_base = |(p, h): (&[f32; 3], &f64)| (*h <= base_below).then(|| flat(p));
+    let base = hull(
+        shape
+            .vertices
+            .iter()
+            .zip(&heights)
+            .filter_map(is_base)
+            .collect(),
+    );
+    let mut centre = [0.0; 2];
+    for (p, m) in shape.vertices.iter().zip(shape.mass) {
+        let q = flat(p);
+        centre[0] += f64::from(*m) * q[0];
+        centre[1] += f64::from(*m) * q[1];
+    }
+    let ratio = area(&base) / area(&all).max(1e-12);
+    if contains(&base, centre) {
+        ratio
+    } else {
+        UNSTABLE * ratio
+    }
+}
+
+fn turn(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
+    (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+}
+
+/// Convex hull, counter-clockwise (Andrew's monotone chain).
+fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
+    points.dedup();
+    if points.len() < 3 {
+        return points;
+    }
+    let mut chain: Vec<[f64; 2]> = Vec::new();
+    for upper in [false, true] {
+        let start = chain.len();
+        let ordered: Vec<[f64; 2]> = if upper {
+            points.iter().rev().copied().collect()
+        } else {
+            points.clone()
+        };
+        for p in ordered {
+            while chain.len() >= start + 2
+                && turn(chain[chain.len() - 2], chain[chain.len() - 1], p) <= 0.0
+            {
+                chain.pop();
+            }
+            chain.push(p);
+        }
+        chain.pop();
+    }
+    chain
+}
+
+fn area(polygon: &[[f64; 2]]) -> f64 {
+    let n = polygon.len();
+    (0..n)
+        .map(|i| {
+            let (p, q) = (polygon[i], polygon[(i + 1) % n]);
+            (p[0] * q[1] - q[0] * p[1]) / 2.0
+        })
+        .sum()
+}
+
+fn contains(polygon: &[[f64; 2]], p: [f64; 2]) -> bool {
+    let n = polygon.len();
+    n >= 3 && (0..n).all(|i| turn(polygon[i], polygon[(i + 1) % n], p) >= 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::Description;
+
+    /// A pyramid of square base and height 2 along `axis`.
+    fn pyramid(axis: usize, sign: f32) -> Description {
+        let mut vertices = Vec::new();
+        for (a, b) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+            let mut p = [0.0f32; 3];
+            p[axis] = -sign;
+            p[(axis + 1) % 3] = a;
+            p[(axis + 2) % 3] = b;
+            vertices.push(p);
+        }
+        let mut tip = [0.0; 3];
+        tip[axis] = sign;
+        vertices.push(tip);
+        Description {
+            mass: vec![0.2; 5],
+            vertices,
+            ..Description::default()
+        }
+    }
+
+    #[test]
+    fn a_pyramid_stands_on_its_base() {
+        for axis in 0..3 {
+            for sign in [1.0f32, -1.0] {
+                let shape = pyramid(axis, sign);
+                let (up, agreement) = estimate_up([shape.view()].iter()).unwrap();
+                assert_eq!(up[axis], f64::from(sign));
+                assert_eq!(agreement, 1.0);
+            }
+        }
+    }
+
+    #[test]
+    fn shapes_that_disagree_have_no_up() {
+        let shapes: Vec<Description> = (0..3).map(|axis| pyramid(axis, 1.0)).collect();
+        let views: Vec<DescriptionView<'_>> = shapes.iter().map(Description::view).collect();
+        assert_eq!(estimate_up(views.iter()), None);
+        assert_eq!(estimate_up([].iter()), None);
+    }
+}
