@@ -224,8 +224,7 @@ impl Library {
         let epoch = old.map_or(0, |m| m.epoch) + 1;
         let outcome = recluster(&shapes, old, epoch, &options);
         let n_shapes = lane.shapes.len() as u64 + 1;
-        let next_recluster =
-            (n_shapes + 1).max((n_shapes as f64 * RECLUSTER_GROWTH).round() as u64);
+        let next_recluster = next_recluster(n_shapes);
         let reclustered = Some((outcome.scores.0, outcome.scores.1, outcome.accepted));
         if let (false, Some(labelling), Some(learnt)) = (outcome.accepted, labelling, &lane.learnt)
         {
@@ -277,6 +276,14 @@ impl Library {
         lane.shapes.remove(at);
         Ok(())
     }
+}
+
+/// Number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 39, 55, …
+fn next_recluster(n_shapes: u64) -> u64 {
+    if n_shapes < TOO_FEW as u64 {
+        return n_shapes + 1;
+    }
+    (n_shapes as f64 * RECLUSTER_GROWTH).round() as u64
 }
 
 /// An addition that is no occasion to cluster anew.
