@@ -16,6 +16,8 @@ use nalgebra::DMatrix;
 const TEMPERATURE: f64 = 0.1;
 /// Weight of the consensus beside the score.
 const CONSENSUS_WEIGHT: f64 = 0.5;
+/// Candidates that are refined before the choice is made.
+const SHORTLIST: usize = 8;
 /// Rounds of classifier and cut, and the area share of change below which they stop.
 const REFINEMENTS: usize = 2;
 const SETTLED: f64 = 0.003;
@@ -71,6 +73,10 @@ pub struct Discovery {
     pub labels: Vec<Vec<u32>>,
     /// Number of labels.
     pub n_labels: usize,
+    /// Its value: score plus consensus.
+    pub value: f64,
+    /// The value of the labelling that is there, judged by the same candidates; negative infinity without one.
+    pub current_value: f64,
 }
 
 /// A shape with its mean descriptors by patch.
@@ -134,6 +140,20 @@ impl<'a> Prepared<'a> {
         Criterion::new(&patches, &self.means, self.dim, &self.offsets)
     }
 
+    /// A labelling of all patches, face by face.
+    fn on_faces(&self, of_patch: &[u32]) -> Vec<Vec<u32>> {
+        let shapes = self.input.shapes.iter().zip(&self.offsets);
+        shapes
+            .map(|(s, o)| {
+                s.patches
+                    .patch_of_face
+                    .iter()
+                    .map(|p| of_patch[o + *p as usize])
+                    .collect()
+            })
+            .collect()
+    }
+
     /// Label of most of each patch's area, over all shapes.
     fn majority(&self, labels: &[Vec<u32>], k: usize) -> Vec<u32> {
         let mut out = Vec::with_capacity(self.area.len());
@@ -153,16 +173,29 @@ impl<'a> Prepared<'a> {
 
 /// Labels the faces of all shapes consistently. Deterministic for given options. The cost grows with the
 /// square of the number of parts (about 25 a shape): meant for up to a few dozen shapes.
-pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Discovery {
+///
+/// `current` is the labelling that is there, if any, with its number of labels; it is judged beside the new one.
+pub fn discover(
+    input: &DiscoveryInput<'_>,
+    options: &DiscoveryOptions,
+    current: Option<(&[Vec<u32>], usize)>,
+) -> Discovery {
     if options.n_labels == Some(1) || input.shapes.is_empty() {
         let labels = input
             .shapes
             .iter()
             .map(|s| vec![0; s.surface.n_faces()])
             .collect();
+        let current_value = if current.is_some() {
+            0.0
+        } else {
+            f64::NEG_INFINITY
+        };
         return Discovery {
             labels,
             n_labels: 1,
+            value: 0.0,
+            current_value,
         };
     }
     let shapes = Prepared::new(input);
@@ -172,12 +205,9 @@ pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Disco
         None => 2..=options.max_labels.max(2),
     };
     let chosen = range
-        .filter_map(|k| {
-            let labels = choose(&shapes, &criterion, k, options.seed)?;
-            Some((criterion.score(&criterion.pair_sums(&labels, k)), k, labels))
-        })
-        .reduce(|best, next| if next.0 > best.0 { next } else { best });
-    let Some((_, k, of_patch)) = chosen else {
+        .filter_map(|k| choose(&shapes, &criterion, k, options.seed, current))
+        .reduce(|best, next| if next.value > best.value { next } else { best });
+    chosen.unwrap_or_else(|| {
         // Fewer patches than labels: each patch its own.
         let labels = input
             .shapes
@@ -190,85 +220,136 @@ pub fn discover(input: &DiscoveryInput<'_>, options: &DiscoveryOptions) -> Disco
             .map(|s| s.patches.len())
             .max()
             .unwrap_or(1);
-        return Discovery { labels, n_labels };
-    };
-    let of_face: Vec<Vec<u32>> = input
-        .shapes
-        .iter()
-        .zip(&shapes.offsets)
-        .map(|(s, o)| {
-            s.patches
-                .patch_of_face
-                .iter()
-                .map(|p| of_patch[o + *p as usize])
-                .collect()
-        })
-        .collect();
-    Discovery {
-        labels: refine(input, of_face, k),
-        n_labels: k,
-    }
+        Discovery {
+            labels,
+            n_labels,
+            value: 0.0,
+            current_value: f64::NEG_INFINITY,
+        }
+    })
 }
 
-/// The score of a face labelling with labels below `k`, as [`discover`] would judge it; comparable between
-/// labellings of the same shapes.
-pub fn labelling_score(input: &DiscoveryInput<'_>, labels: &[Vec<u32>], k: usize) -> f64 {
-    let shapes = Prepared::new(input);
-    let criterion = shapes.criterion();
-    criterion.score(&criterion.pair_sums(&shapes.majority(labels, k), k))
+/// Judges labellings: by the criterion, and by how much they agree with what the good candidates agree on.
+struct Judge<'a> {
+    criterion: &'a Criterion,
+    /// Candidate labellings of all patches, and the softmax of their scores.
+    candidates: Vec<Vec<u32>>,
+    weights: Vec<f64>,
+    area: &'a [f64],
+    k: usize,
 }
 
-/// The labelling of patches with the best score plus consensus; `None` if there is none with `k` labels.
-fn choose(shapes: &Prepared<'_>, criterion: &Criterion, k: usize, seed: u64) -> Option<Vec<u32>> {
-    let labellings = pool(shapes, criterion, k, seed);
-    let scores: Vec<f64> = labellings
-        .iter()
-        .map(|l| criterion.score(&criterion.pair_sums(l, k)))
-        .collect();
-    let consensus = consensus(&labellings, &scores, &shapes.area, k);
-    let total: Vec<f64> = scores
-        .iter()
-        .zip(&consensus)
-        .map(|(s, c)| s + CONSENSUS_WEIGHT * c)
-        .collect();
-    let best = (0..total.len()).max_by(|&a, &b| total[a].total_cmp(&total[b]).then(b.cmp(&a)))?;
-    labellings.into_iter().nth(best)
-}
-
-/// For each labelling the mean normalised mutual information with all of them, weighted by the softmax of the
-/// scores; areas weigh the patches.
-fn consensus(labellings: &[Vec<u32>], scores: &[f64], area: &[f64], k: usize) -> Vec<f64> {
-    let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mut weights: Vec<f64> = scores
-        .iter()
-        .map(|s| ((s - top) / TEMPERATURE).exp())
-        .collect();
-    let sum: f64 = weights.iter().sum();
-    weights.iter_mut().for_each(|w| *w /= sum);
-    let total: f64 = area.iter().sum();
-    let n = labellings.len();
-    let mut indicator = DMatrix::<f64>::zeros(area.len(), n * k);
-    for (c, labels) in labellings.iter().enumerate() {
-        for (p, l) in labels.iter().enumerate() {
-            indicator[(p, c * k + *l as usize)] = (area[p] / total).sqrt();
+impl<'a> Judge<'a> {
+    fn new(criterion: &'a Criterion, candidates: Vec<Vec<u32>>, area: &'a [f64], k: usize) -> Self {
+        let scores: Vec<f64> = candidates
+            .iter()
+            .map(|l| criterion.score(&criterion.pair_sums(l, k)))
+            .collect();
+        let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mut weights: Vec<f64> = scores
+            .iter()
+            .map(|s| ((s - top) / TEMPERATURE).exp())
+            .collect();
+        let sum: f64 = weights.iter().sum();
+        weights.iter_mut().for_each(|w| *w /= sum);
+        Self {
+            criterion,
+            candidates,
+            weights,
+            area,
+            k,
         }
     }
-    let joint = indicator.transpose() * &indicator;
-    let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
-    let own: Vec<f64> = (0..n)
-        .map(|c| (0..k).map(|l| entropy(joint[(c * k + l, c * k + l)])).sum())
-        .collect();
-    (0..n)
-        .map(|a| {
-            (0..n)
-                .map(|b| {
-                    let block = joint.view((a * k, b * k), (k, k));
-                    let both: f64 = block.iter().map(|p| entropy(*p)).sum();
-                    weights[b] * (own[a] + own[b] - both) / (own[a] * own[b]).sqrt().max(1e-9)
-                })
+
+    /// Score plus weighted consensus of each labelling of all patches, with labels below `k`.
+    fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
+        let consensus = self.consensus(labellings, k);
+        labellings
+            .iter()
+            .zip(consensus)
+            .map(|(l, c)| {
+                self.criterion.score(&self.criterion.pair_sums(l, k)) + CONSENSUS_WEIGHT * c
+            })
+            .collect()
+    }
+
+    /// For each labelling the mean normalised mutual information with the candidates; areas weigh the patches.
+    fn consensus(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
+        let (mine, theirs) = (
+            self.indicator(labellings, k),
+            self.indicator(&self.candidates, self.k),
+        );
+        let joint = mine.transpose() * &theirs;
+        let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
+        let own = |m: &DMatrix<f64>, c: usize, k: usize| -> f64 {
+            (0..k)
+                .map(|l| entropy(m.column(c * k + l).norm_squared()))
                 .sum()
-        })
-        .collect()
+        };
+        let their_own: Vec<f64> = (0..self.candidates.len())
+            .map(|c| own(&theirs, c, self.k))
+            .collect();
+        (0..labellings.len())
+            .map(|a| {
+                let my_own = own(&mine, a, k);
+                let agreement = |b: usize| {
+                    let block = joint.view((a * k, b * self.k), (k, self.k));
+                    let both: f64 = block.iter().map(|p| entropy(*p)).sum();
+                    (my_own + their_own[b] - both) / (my_own * their_own[b]).sqrt().max(1e-9)
+                };
+                (0..self.candidates.len())
+                    .map(|b| self.weights[b] * agreement(b))
+                    .sum()
+            })
+            .collect()
+    }
+
+    /// Column `c k + l` holds the roots of the area shares of the patches that labelling c gives label l.
+    fn indicator(&self, labellings: &[Vec<u32>], k: usize) -> DMatrix<f64> {
+        let total: f64 = self.area.iter().sum();
+        let mut indicator = DMatrix::zeros(self.area.len(), labellings.len() * k);
+        for (c, labels) in labellings.iter().enumerate() {
+            for (p, l) in labels.iter().enumerate() {
+                indicator[(p, c * k + *l as usize)] = (self.area[p] / total).sqrt();
+            }
+        }
+        indicator
+    }
+}
+
+/// The best labelling with `k` labels: the best candidates are refined face by face, and judged again as what they
+/// became. `None` if there is no candidate.
+fn choose(
+    shapes: &Prepared<'_>,
+    criterion: &Criterion,
+    k: usize,
+    seed: u64,
+    current: Option<(&[Vec<u32>], usize)>,
+) -> Option<Discovery> {
+    let candidates = pool(shapes, criterion, k, seed);
+    let judge = Judge::new(criterion, candidates, &shapes.area, k);
+    let values = judge.values(&judge.candidates, k);
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|&a, &b| values[b].total_cmp(&values[a]).then(a.cmp(&b)));
+    let refined: Vec<Vec<Vec<u32>>> = order
+        .iter()
+        .take(SHORTLIST)
+        .map(|&c| refine(shapes.input, shapes.on_faces(&judge.candidates[c]), k))
+        .collect();
+    let as_patches: Vec<Vec<u32>> = refined.iter().map(|l| shapes.majority(l, k)).collect();
+    let values = judge.values(&as_patches, k);
+    let best =
+        (0..values.len()).max_by(|&a, &b| values[a].total_cmp(&values[b]).then(b.cmp(&a)))?;
+    let current_value = current.map_or(f64::NEG_INFINITY, |(labels, n)| {
+        judge.values(&[shapes.majority(labels, n)], n)[0]
+    });
+    let labels = refined.into_iter().nth(best)?;
+    Some(Discovery {
+        labels,
+        n_labels: k,
+        value: values[best],
+        current_value,
+    })
 }
 
 /// Alternates a linear classifier of all faces and a cut of each shape.

@@ -16,9 +16,7 @@ pub mod score;
 mod up;
 
 pub use boundary::refine_boundary;
-pub use discover::{
-    Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover, labelling_score,
-};
+pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
 pub use up::estimate_up;

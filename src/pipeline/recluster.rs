@@ -4,7 +4,7 @@
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
     Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation, ShapeInput,
-    Statistics, discover, labelling_score,
+    Statistics, discover,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -116,14 +116,10 @@ pub fn recluster(
             .collect(),
         up_known: options.up.is_some(),
     };
-    let found = discover(&input, &options.discovery);
     let current = old.map(|model| current_classes(shapes, model));
-    let score_of = |classes: &[Vec<u32>], k: usize| labelling_score(&input, classes, k);
-    let new_score = score_of(&found.labels, found.n_labels);
-    let old_score = match (&current, old) {
-        (Some(classes), Some(model)) => score_of(classes, model.labels.len()),
-        _ => f64::NEG_INFINITY,
-    };
+    let there = current.as_deref().zip(old.map(|m| m.labels.len()));
+    let found = discover(&input, &options.discovery, there);
+    let (old_score, new_score) = (found.current_value, found.value);
     let accepted = options.always || new_score > old_score + MIN_GAIN;
     let (labels, classes, changes) = match (accepted, current, old) {
         (false, Some(classes), Some(model)) => (model.labels.clone(), classes, Vec::new()),
