@@ -64,7 +64,10 @@ struct Scratch(PathBuf);
 
 impl Scratch {
     fn create() -> Result<Self, CommandError> {
-        let path = std::env::temp_dir().join(format!("coseg-demo-{}", std::process::id()));
+        // Process ids come again, in containers all the time, and a killed demonstration cleans nothing.
+        let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        let (id, nanos) = (std::process::id(), since.map_or(0, |d| d.as_nanos()));
+        let path = std::env::temp_dir().join(format!("coseg-demo-{id}-{nanos:x}"));
         let created = std::fs::DirBuilder::new().mode(0o700).create(&path);
         created.map_err(|e| at(&path, e))?;
         Ok(Self(path))

@@ -232,9 +232,12 @@ pub(crate) fn event_line(e: &wire::Event) -> String {
         Some(Kind::LabelNamed(n)) => format!("label {} named {:?}", n.label, n.name),
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
+            let before = r
+                .score_before
+                .map_or("none".to_owned(), |s| format!("{s:.3}"));
             format!(
-                "reclustered, score {:.3} to {:.3}, {taken}",
-                r.score_before, r.score_after
+                "reclustered, score {before} to {:.3}, {taken}",
+                r.score_after
             )
         }
         Some(Kind::Heartbeat(_)) => "heartbeat".to_owned(),

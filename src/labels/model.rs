@@ -144,7 +144,7 @@ impl Classifier {
 /// The label model of a collection.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelModel {
-    /// Counts the re-clusterings that were taken into the model; statistics of another epoch do not mix.
+    /// Counts the re-clusterings that were accepted; statistics of another epoch do not mix.
     pub epoch: u64,
     /// Label id of each class `(k,)`.
     pub labels: Vec<u32>,

@@ -73,8 +73,7 @@ impl Library {
                 tx.put_map(&map_row(*from, id, map))?;
             }
             if let Some((before, after, accepted)) = commit.plan.reclustered {
-                // Infinite before the first clustering, which JSON cannot hold.
-                let score_before = if before.is_finite() { before } else { f64::MIN };
+                let score_before = before.is_finite().then_some(before);
                 let kind = EventKind::Reclustered {
                     score_before,
                     score_after: after,

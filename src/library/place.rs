@@ -223,6 +223,18 @@ impl Library {
         };
         let epoch = old.map_or(0, |m| m.epoch) + 1;
         let outcome = recluster(&shapes, old, epoch, &options);
+        let n_shapes = lane.shapes.len() as u64 + 1;
+        let next_recluster = next_recluster(n_shapes);
+        let reclustered = Some((outcome.scores.0, outcome.scores.1, outcome.accepted));
+        if let (false, Some(labelling), Some(learnt)) = (outcome.accepted, labelling, &lane.learnt)
+        {
+            // The epoch goes on: what is stale is labelled by the model and the representatives that
+            // made it so, whether that happens before or after this.
+            let mut plan = grown(lane, learnt, labelling, view);
+            plan.state.next_recluster = next_recluster;
+            plan.reclustered = reclustered;
+            return Ok(plan);
+        }
         let mut labellings = outcome.labellings;
         let Some(labelling) = labellings.pop() else {
             unreachable!("the new shape is the last representative")
@@ -231,24 +243,18 @@ impl Library {
             .iter()
             .map(|at| lane.shapes[*at].ordinal)
             .chain([lane.row.next_ordinal]);
-        let n_shapes = lane.shapes.len() as u64 + 1;
         let state = CollectionState {
-            next_recluster: (n_shapes + 1).max((n_shapes as f64 * RECLUSTER_GROWTH).round() as u64),
+            next_recluster,
             representatives: ordinals.collect(),
             epoch_ordinal: lane.row.next_ordinal,
-        };
-        let relabelled = if outcome.accepted {
-            known.into_iter().zip(labellings).collect()
-        } else {
-            Vec::new()
         };
         Ok(Plan {
             learnt: Learnt::begin(outcome.model),
             state,
             labelling,
-            relabelled,
+            relabelled: known.into_iter().zip(labellings).collect(),
             changes: outcome.changes,
-            reclustered: Some((outcome.scores.0, outcome.scores.1, outcome.accepted)),
+            reclustered,
         })
     }
 
@@ -270,6 +276,14 @@ impl Library {
         lane.shapes.remove(at);
         Ok(())
     }
+}
+
+/// Number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 39, 55, …
+fn next_recluster(n_shapes: u64) -> u64 {
+    if n_shapes < TOO_FEW as u64 {
+        return n_shapes + 1;
+    }
+    (n_shapes as f64 * RECLUSTER_GROWTH).round() as u64
 }
 
 /// An addition that is no occasion to cluster anew.

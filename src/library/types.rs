@@ -357,7 +357,7 @@ pub enum EventKind {
     /// The parts of the collection were clustered anew.
     Reclustered {
         /// Score of the labelling before and after; see docs/architecture.md.
-        score_before: f64,
+        score_before: Option<f64>,
         /// Score of the new labelling.
         score_after: f64,
         /// Whether the new labelling was taken.

@@ -239,7 +239,7 @@ fn refuses_meshes_without_laplacian() {
     };
     assert_eq!(
         message(&good, &[bridge]),
-        "bridge 0 joins vertices [3, 12], but needs two different ones of 12"
+        "bridge 0 joins vertices [3, 12], but there are only 12"
     );
     let mut m = good.clone();
     m.vertices.fill([0.5; 3]);

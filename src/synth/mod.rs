@@ -9,6 +9,7 @@ mod families;
 mod field;
 mod parts;
 mod remesh;
+mod solid;
 mod surface;
 mod vector;
 

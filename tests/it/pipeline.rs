@@ -3,8 +3,7 @@
 use coseg::Library;
 use coseg::labels::score::{Score, ScoredShape, score};
 use coseg::library::{
-    CollectionSpec, EventKind, LibraryError, MAX_MAPS, MAX_REPRESENTATIVES, NewShape,
-    Outcome, Up,
+    CollectionSpec, EventKind, LibraryError, MAX_MAPS, MAX_REPRESENTATIVES, NewShape, Outcome, Up,
 };
 use coseg::mesh::write::off;
 use coseg::mesh::{Format, TriMesh, parse};

@@ -1,7 +1,8 @@
 //! Birds: standing with folded wings, or with wings spread; short necks and long ones.
 
 use crate::synth::dice::Dice;
-use crate::synth::field::{Scene, Solid};
+use crate::synth::field::Scene;
+use crate::synth::solid::Solid;
 use crate::synth::vector::{Frame, Vec3, add, along, bezier, closed_curve, scale, turn};
 
 pub(in crate::synth) const LABELS: &[&str] = &["body", "head", "neck", "wing", "tail", "leg"];

@@ -1,7 +1,8 @@
 //! Chairs: on four legs, a pedestal or runners; back solid, of bars or of rungs; with and without arms.
 
 use crate::synth::dice::Dice;
-use crate::synth::field::{Scene, Solid};
+use crate::synth::field::Scene;
+use crate::synth::solid::Solid;
 use crate::synth::vector::{Frame, Vec3, along, closed_curve, mix, norm, sub, turn};
 
 pub(in crate::synth) const LABELS: &[&str] = &["seat", "back", "leg", "arm"];

@@ -1,7 +1,8 @@
 //! Containers: cups, vases, jugs and goblets, hollow, with none, one or two handles.
 
 use crate::synth::dice::Dice;
-use crate::synth::field::{Scene, Solid};
+use crate::synth::field::Scene;
+use crate::synth::solid::Solid;
 use crate::synth::vector::{Frame, Vec3, bezier, open_curve, turn};
 
 pub(in crate::synth) const LABELS: &[&str] = &["body", "neck", "handle", "foot"];

@@ -1,7 +1,8 @@
 //! Guitars: body, neck and head, from the classical figure of eight to arrow-shaped electric ones.
 
 use crate::synth::dice::Dice;
-use crate::synth::field::{Scene, Solid};
+use crate::synth::field::Scene;
+use crate::synth::solid::Solid;
 use crate::synth::vector::{Frame, closed_curve, turn};
 
 pub(in crate::synth) const LABELS: &[&str] = &["body", "neck", "head"];

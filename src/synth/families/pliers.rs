@@ -1,7 +1,8 @@
 //! Pliers: two levers crossing at a joint, jaws pointed, flat or curved, handles straight or bowed.
 
 use crate::synth::dice::Dice;
-use crate::synth::field::{Scene, Solid};
+use crate::synth::field::Scene;
+use crate::synth::solid::Solid;
 use crate::synth::vector::{Frame, Vec3, bezier};
 
 pub(in crate::synth) const LABELS: &[&str] = &["handle", "jaw", "joint"];
