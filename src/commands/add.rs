@@ -68,7 +68,12 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
         counts: HashMap::new(),
         n_failed: 0,
     };
-    let max_shapes = BATCH_SHAPES.min(limits.max_shapes_per_request.max(1) as usize);
+    // A batch that the whole queue cannot hold would be refused for ever.
+    let max_queued = usize::try_from(limits.max_queued_shapes).unwrap_or(usize::MAX);
+    let max_shapes = BATCH_SHAPES
+        .min(limits.max_shapes_per_request as usize)
+        .min(max_queued)
+        .max(1);
     let max_bytes = BATCH_BYTES.min(limits.max_message_bytes / 2);
     let mut jobs = VecDeque::new();
     let mut batch = Batch::default();
