@@ -17,10 +17,12 @@ mod polish;
 use crate::linalg::block_lanczos::Exhausted;
 use crate::linalg::dense_eigen::DenseEigenError;
 use crate::linalg::ldlt::LdltError;
-use crate::linalg::panel::WIDTH;
+use crate::linalg::panel::{Row, WIDTH};
 use component::{Component, components, validate};
 use connected::{Pairs, Setting, smallest};
 use nalgebra::DMatrix;
+use rayon::prelude::{IntoParallelIterator, ParallelIterator};
+use std::collections::HashMap;
 
 /// Called on entering each stage and at each iteration with the name of the stage; `false` cancels.
 pub type StageHook<'a> = &'a dyn Fn(&str) -> bool;
@@ -283,7 +285,7 @@ impl Spectrum {
             solve_components(&parts, k, &setting)?
         };
         hook.enter("assemble")?;
-        assemble(&parts, &solved, k, n)
+        assemble(&parts, &solved, k, n, setting.parallel)
     }
 }
 
@@ -302,7 +304,7 @@ fn solve_components(
             setting.hook.enter("components")?;
             parts
                 .iter()
-                .map(|p| Ok(p.factor(limit)?.0.n_negative))
+                .map(|p| Ok(p.inertia(limit)?.0.n_negative))
                 .collect()
         };
         let enough = |counts: &[usize]| counts.iter().sum::<usize>() >= k;
@@ -368,6 +370,7 @@ fn assemble(
     solved: &[Pairs],
     k: usize,
     n: usize,
+    parallel: bool,
 ) -> Result<Spectrum, SpectrumError> {
     // (value, component, index in it): ties go to the earlier component.
     let mut order: Vec<(f64, usize, usize)> = solved
@@ -386,6 +389,9 @@ fn assemble(
     let mut eigenvalues = Vec::with_capacity(k);
     let mut residuals = Vec::with_capacity(k);
     let mut flat = vec![0.0; n * k];
+    // Where the columns of each panel of each component go.
+    let mut groups: Vec<(usize, usize, Vec<(usize, &mut [f64])>)> = Vec::new();
+    let mut group_of = HashMap::new();
     for (&(value, c, i), column) in order[..k].iter().zip(flat.chunks_exact_mut(n)) {
         if value < -1e-6 * order[k - 1].0.abs() {
             return Err(SpectrumError::NotSemidefinite {
@@ -395,24 +401,22 @@ fn assemble(
         }
         eigenvalues.push(if value < zero { 0.0 } else { value });
         residuals.push(solved[c].residuals[i]);
-        let panel = &solved[c].panels[i / WIDTH];
-        let part = &parts[c];
-        for ((row, &v), &s) in panel
-            .iter()
-            .zip(&part.vertices)
-            .zip(&part.inverse_sqrt_mass)
-        {
-            column[v as usize] = row.0[i % WIDTH] * s;
-        }
-        let mut largest = 0.0f64;
-        for &x in column.iter() {
-            if x.abs() > largest.abs() {
-                largest = x;
-            }
-        }
-        if largest < 0.0 {
-            column.iter_mut().for_each(|x| *x = -*x);
-        }
+        let group = *group_of.entry((c, i / WIDTH)).or_insert_with(|| {
+            groups.push((c, i / WIDTH, Vec::with_capacity(WIDTH)));
+            groups.len() - 1
+        });
+        groups[group].2.push((i % WIDTH, column));
+    }
+    let by_vertex: Vec<_> = parts.iter().map(Component::rows_by_vertex).collect();
+    let write = |panel: &mut Vec<Row>, (c, p, mut columns): (usize, usize, Vec<_>)| {
+        solved[c].vectors.copy_panel(p, panel);
+        write_columns(&parts[c], panel, &by_vertex[c], &mut columns);
+    };
+    if parallel {
+        groups.into_par_iter().for_each_init(Vec::new, write);
+    } else {
+        let mut panel = Vec::new();
+        groups.into_iter().for_each(|g| write(&mut panel, g));
     }
     Ok(Spectrum {
         eigenvalues,
@@ -429,6 +433,36 @@ fn assemble(
             n_repair: solved.iter().map(|s| s.n_repair).sum(),
         },
     })
+}
+
+/// Writes columns of one panel, scaled to A-length 1 and with their canonical signs, in the order of
+/// the vertices: memory is written in sequence, and the eight numbers of a row are read at once.
+fn write_columns(
+    part: &Component,
+    panel: &[Row],
+    by_vertex: &[(u32, u32)],
+    columns: &mut [(usize, &mut [f64])],
+) {
+    let mut largest = [0.0f64; WIDTH];
+    for &(vertex, row) in by_vertex {
+        let scale = part.inverse_sqrt_mass[row as usize];
+        let x = panel[row as usize].0.map(|x| x * scale);
+        for (l, x) in largest.iter_mut().zip(x) {
+            if x.abs() > l.abs() {
+                *l = x;
+            }
+        }
+        for (from, column) in columns.iter_mut() {
+            column[vertex as usize] = x[*from];
+        }
+    }
+    for (from, column) in columns {
+        if largest[*from] < 0.0 {
+            for &(vertex, _) in by_vertex {
+                column[vertex as usize] *= -1.0;
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -1,16 +1,18 @@
 //! A symmetric operator on panels becomes its block tridiagonal projection on a Krylov space, whose
 //! eigenpairs approximate those of largest magnitude.
 //!
-//! Block Lanczos with 16 columns and full re-orthogonalisation: no restart, no ghost copies, and
+//! Block Lanczos with 8 columns and full re-orthogonalisation: no restart, no ghost copies, and
 //! every inner loop is a matrix product (Golub and Underwood 1977; Grimes, Lewis and Simon, *A
 //! Shifted Block Lanczos Algorithm*, 1994).
 
 // Small matrices and register tiles read best with their indices.
 #![allow(clippy::needless_range_loop)]
 
+use super::basis::Basis;
 use super::dense_eigen::{DenseEigenError, symmetric_eigen};
 use super::panel::{
-    Basis, Row, Tile, WIDTH, ZERO_TILE, gram, multiply_in_place, tile_product, zero_panel,
+    Row, Tile, WIDTH, ZERO_TILE, add_product, gram, multiply_in_place, negated, tile_product,
+    zero_panel,
 };
 use faer::Mat;
 use rand::{Rng, SeedableRng};
@@ -42,8 +44,13 @@ pub struct BlockLanczos<'a> {
     /// Diagonal and subdiagonal tiles of the projection.
     diagonal: Vec<Tile>,
     subdiagonal: Vec<Tile>,
+    /// The newest block, and whether it is orthogonal to all before it but for rounding.
     next: Vec<Row>,
+    clean: bool,
+    /// Memory for the image of the newest block.
+    spare: Vec<Row>,
     random: Pcg64,
+    parallel: bool,
 }
 
 /// Eigenpairs of the projection.
@@ -72,7 +79,10 @@ impl<'a> BlockLanczos<'a> {
             diagonal: Vec::new(),
             subdiagonal: Vec::new(),
             next: zero_panel(n),
+            clean: true,
+            spare: Vec::new(),
             random: Pcg64::seed_from_u64(seed),
+            parallel,
         };
         for row in &mut this.next[..n] {
             for x in &mut row.0 {
@@ -81,7 +91,7 @@ impl<'a> BlockLanczos<'a> {
         }
         let scale = column_lengths(&this.next);
         let mut next = std::mem::take(&mut this.next);
-        this.locked.remove(0, &mut next);
+        this.locked.remove(0, [&mut next]);
         this.orthonormalise(&mut next, &scale)?;
         this.next = next;
         Ok(this)
@@ -92,26 +102,31 @@ impl<'a> BlockLanczos<'a> {
         self.diagonal.len() * WIDTH
     }
 
-    /// Adds one block: applies `operator` in place to the newest one.
+    /// Adds one block: applies `operator` in place to a copy of the newest one.
+    ///
+    /// The three-term recurrence leaves components along the older blocks that are rounding of the
+    /// operator. Every second step removes them, from the newest block and from its image at once:
+    /// one pass over the basis serves two blocks, and no block enters it before it is clean.
     pub fn step(&mut self, operator: &dyn Fn(&mut [Row])) -> Result<(), Exhausted> {
-        let mut w = std::mem::take(&mut self.next);
-        self.basis.push(&w);
+        let mut q = std::mem::take(&mut self.next);
+        let mut w = std::mem::take(&mut self.spare);
+        w.clone_from(&q);
         operator(&mut w);
         let scale = column_lengths(&w);
-        let last = self.basis.n_panels() - 1;
-        // The three-term recurrence first, so that the full pass only meets rounding errors.
-        let local = self.basis.remove(last.saturating_sub(1), &mut w);
-        self.locked.remove(0, &mut w);
-        let full = self.basis.remove(0, &mut w);
-        let mut diagonal = ZERO_TILE;
-        let (a, b) = (&local[local.len() - 1], &full[last]);
-        for i in 0..WIDTH {
-            for j in 0..WIDTH {
-                let both = a[i].0[j] + b[i].0[j] + a[j].0[i] + b[j].0[i];
-                diagonal[i].0[j] = 0.5 * both;
-            }
+        let before = self.basis.n_panels().saturating_sub(1);
+        self.basis.remove(before, [&mut w]);
+        let d = gram(&q, &w, self.parallel);
+        add_product(&q, &negated(&d), &mut w, self.parallel);
+        if self.clean {
+            self.locked.remove(0, [&mut w]);
+        } else {
+            self.locked.remove(0, [&mut q, &mut w]);
+            self.basis.remove(0, [&mut q, &mut w]);
         }
-        self.diagonal.push(diagonal);
+        self.clean = !self.clean;
+        self.diagonal.push(symmetric_part(&d));
+        self.basis.push(&q);
+        self.spare = q;
         let r = self.orthonormalise(&mut w, &scale)?;
         self.subdiagonal.push(r);
         self.next = w;
@@ -123,25 +138,20 @@ impl<'a> BlockLanczos<'a> {
     /// a zero column on the diagonal of R.
     fn orthonormalise(&mut self, w: &mut [Row], scale: &[f64; WIDTH]) -> Result<Tile, Exhausted> {
         let mut total = identity();
-        let mut shrunk = false;
         for pass in 0..3 {
-            let g = gram(w, w);
+            let g = gram(w, w, self.parallel);
             let Some((r, inverse)) = cholesky(&g) else {
                 return self.orthonormalise_slowly(w, scale, &total);
             };
-            if pass == 0 {
-                if (0..WIDTH).any(|j| r[j].0[j] < LOST * scale[j]) {
-                    return self.orthonormalise_slowly(w, scale, &total);
-                }
-                shrunk = (0..WIDTH).any(|j| r[j].0[j] < SHRUNK * scale[j]);
+            if pass == 0 && (0..WIDTH).any(|j| r[j].0[j] < LOST * scale[j]) {
+                return self.orthonormalise_slowly(w, scale, &total);
             }
-            multiply_in_place(w, &inverse);
+            multiply_in_place(w, &inverse, self.parallel);
             total = tile_product(&r, &total);
-            if pass == 0 && shrunk {
-                self.locked.remove(0, w);
-                self.basis.remove(0, w);
-            }
-            if pass >= 1 && !(pass == 1 && shrunk) {
+            if pass == 0 && (0..WIDTH).any(|j| r[j].0[j] < SHRUNK * scale[j]) {
+                self.locked.remove(0, [w]);
+                self.basis.remove(0, [w]);
+            } else if well_conditioned(&r) {
                 break;
             }
         }
@@ -204,14 +214,14 @@ impl<'a> BlockLanczos<'a> {
             }
         }
         // A last pass against everything: small remainders were scaled up.
-        self.locked.remove(0, w);
-        self.basis.remove(0, w);
-        let g = gram(w, w);
+        self.locked.remove(0, [w]);
+        self.basis.remove(0, [w]);
+        let g = gram(w, w, self.parallel);
         let (again, inverse) = cholesky(&g).ok_or(Exhausted {
             n: self.n,
             n_found: self.dimension(),
         })?;
-        multiply_in_place(w, &inverse);
+        multiply_in_place(w, &inverse, self.parallel);
         Ok(tile_product(&again, &tile_product(&r, before)))
     }
 
@@ -220,8 +230,8 @@ impl<'a> BlockLanczos<'a> {
         for (s, row) in single.iter_mut().zip(w.iter()) {
             s.0[0] = row.0[j];
         }
-        self.locked.remove(0, &mut single);
-        self.basis.remove(0, &mut single);
+        self.locked.remove(0, [&mut single]);
+        self.basis.remove(0, [&mut single]);
         for (s, row) in single.iter().zip(w.iter_mut()) {
             row.0[j] = s.0[0];
         }
@@ -270,9 +280,9 @@ impl<'a> BlockLanczos<'a> {
         })
     }
 
-    /// Ritz vectors after one more application of the operator, which comes free: the panels of
-    /// `operator(V y) / θ`. Consumes the space.
-    pub fn vectors(mut self, projection: &Projection, selected: &[usize]) -> Vec<Vec<Row>> {
+    /// Ritz vectors after one more application of the operator, which comes free: the columns of
+    /// `operator(V y) / θ`, a column of zeros for each `None`. Consumes the space.
+    pub fn vectors(mut self, projection: &Projection, selected: &[Option<usize>]) -> Basis {
         let blocks = self.diagonal.len();
         let next = std::mem::take(&mut self.next);
         self.basis.push(&next);
@@ -280,7 +290,8 @@ impl<'a> BlockLanczos<'a> {
             .chunks(WIDTH)
             .map(|group| {
                 let mut tiles = vec![ZERO_TILE; blocks + 1];
-                for (column, &e) in group.iter().enumerate() {
+                for (column, e) in group.iter().enumerate() {
+                    let Some(e) = *e else { continue };
                     for (b, tile) in tiles[..blocks].iter_mut().enumerate() {
                         for (i, row) in tile.iter_mut().enumerate() {
                             row.0[column] = projection.vectors[(b * WIDTH + i, e)];
@@ -294,8 +305,21 @@ impl<'a> BlockLanczos<'a> {
                 tiles
             })
             .collect();
-        self.basis.combinations(&coefficients)
+        self.basis.transform(&coefficients);
+        self.basis
     }
+}
+
+/// Whether one Cholesky QR pass leaves columns orthogonal to about 1e-14.
+fn well_conditioned(r: &Tile) -> bool {
+    let diagonal = || (0..WIDTH).map(|j| r[j].0[j]);
+    let largest = diagonal().fold(0.0, f64::max);
+    diagonal().all(|d| d > 0.05 * largest)
+}
+
+/// `(D + Dᵀ) / 2`.
+fn symmetric_part(d: &Tile) -> Tile {
+    std::array::from_fn(|i| Row(std::array::from_fn(|j| 0.5 * (d[i].0[j] + d[j].0[i]))))
 }
 
 fn identity() -> Tile {

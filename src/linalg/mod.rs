@@ -1,6 +1,7 @@
 //! Numerical tools that know nothing of meshes.
 
 pub mod assignment;
+pub mod basis;
 pub mod block_lanczos;
 pub mod dense_eigen;
 pub mod kmeans;

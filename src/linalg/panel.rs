@@ -1,38 +1,39 @@
-//! Tall matrices 16 columns wide become projections and combinations of each other at the speed of
-//! a matrix product.
+//! Tall matrices 8 columns wide become products with each other at the speed of a matrix product.
 //!
 //! A *panel* is `n` rows of [`WIDTH`] numbers, row-major, padded with zero rows to a multiple of
-//! [`CHUNK`]. A [`Basis`] holds many panels so that the same rows of all of them lie together
-//! (chunk-major): one pass over memory then serves one product, whatever the number of panels.
-//!
-//! Reductions over rows are cut into at most [`SLABS`] slabs whose bounds depend on `n` alone and
-//! are added up in order: the same bits come out for any number of threads.
+//! [`PADDING`]; a [`Row`] is one line of the cache.
 
 // Small matrices and register tiles read best with their indices.
 #![allow(clippy::needless_range_loop)]
 
+use bytemuck::{Pod, Zeroable};
 use pulp::{Arch, Simd, WithSimd};
-use rayon::prelude::{
-    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefMutIterator, ParallelIterator,
-};
-use rayon::slice::ParallelSliceMut;
-
+use rayon::iter::{IndexedParallelIterator, ParallelIterator};
+use rayon::slice::{ParallelSlice, ParallelSliceMut};
 /// Columns of a panel.
-pub const WIDTH: usize = 16;
+pub const WIDTH: usize = 8;
 
-/// Rows of a chunk: a multiple of the 6 rows a kernel holds in registers; two chunks of 12 KiB fit
-/// into the first-level cache.
-pub const CHUNK: usize = 96;
+/// Rows of a chunk: as many as a kernel holds in registers, so that the same rows of hundreds of
+/// panels are one short stream of memory.
+pub const CHUNK: usize = 6;
 
-/// Independent partial sums of a reduction over rows.
-const SLABS: usize = 8;
+/// Chunks that a projection takes together, from as many streams: an accumulator is loaded and
+/// stored once for all of them.
+pub(super) const BURST: usize = 4;
 
-/// Chunks that threads share out between them at a time.
-const BATCH: usize = 16;
+/// Panels are padded with zero rows to a multiple of this.
+pub const PADDING: usize = CHUNK * BURST;
+
+/// Independent partial sums of a reduction over rows, whose bounds depend on the number of rows
+/// alone: the same bits come out for any number of threads.
+pub(super) const SLABS: usize = 8;
+
+/// Rows that a thread takes at a time.
+const PIECE: usize = 64 * PADDING;
 
 /// One row of a panel.
 #[repr(C, align(64))]
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct Row(pub [f64; WIDTH]);
 
 impl Row {
@@ -40,7 +41,7 @@ impl Row {
     pub const ZERO: Row = Row([0.0; WIDTH]);
 }
 
-/// A `(16, 16)` matrix, row-major.
+/// An `(8, 8)` matrix, row-major.
 pub type Tile = [Row; WIDTH];
 
 /// The zero tile.
@@ -48,146 +49,10 @@ pub const ZERO_TILE: Tile = [Row::ZERO; WIDTH];
 
 /// A panel of zeros with `n` rows and padding.
 pub fn zero_panel(n: usize) -> Vec<Row> {
-    vec![Row::ZERO; n.div_ceil(CHUNK) * CHUNK]
+    vec![Row::ZERO; n.next_multiple_of(PADDING)]
 }
 
-/// Panels with the same number of rows, stored chunk by chunk.
-#[derive(Debug, Clone)]
-pub struct Basis {
-    chunks: Vec<Vec<Row>>,
-    n_panels: usize,
-    parallel: bool,
-}
-
-impl Basis {
-    /// An empty basis of panels with `n` rows, with room for `capacity` of them. `parallel`: work
-    /// on slabs of rows in the rayon pool of the caller.
-    pub fn new(n: usize, capacity: usize, parallel: bool) -> Self {
-        let chunks = (0..n.div_ceil(CHUNK))
-            .map(|_| Vec::with_capacity(capacity * CHUNK))
-            .collect();
-        Self {
-            chunks,
-            n_panels: 0,
-            parallel,
-        }
-    }
-
-    /// Number of panels.
-    pub fn n_panels(&self) -> usize {
-        self.n_panels
-    }
-
-    /// Appends a panel.
-    pub fn push(&mut self, panel: &[Row]) {
-        for (chunk, rows) in self.chunks.iter_mut().zip(panel.chunks_exact(CHUNK)) {
-            chunk.extend_from_slice(rows);
-        }
-        self.n_panels += 1;
-    }
-
-    /// Copies panel `j` out.
-    pub fn panel(&self, j: usize) -> Vec<Row> {
-        let mut out = Vec::with_capacity(self.chunks.len() * CHUNK);
-        for chunk in &self.chunks {
-            out.extend_from_slice(&chunk[j * CHUNK..(j + 1) * CHUNK]);
-        }
-        out
-    }
-
-    /// `V_jᵀ W` for every panel `j >= first`.
-    pub fn project(&self, first: usize, panel: &[Row]) -> Vec<Tile> {
-        let arch = Arch::new();
-        let per_slab = self.chunks.len().div_ceil(SLABS).max(1);
-        let n_tiles = self.n_panels - first;
-        let n_slabs = self.chunks.len().div_ceil(per_slab);
-        let slab = |s: usize| {
-            let mut tiles = vec![ZERO_TILE; n_tiles];
-            let begin = s * per_slab;
-            let end = (begin + per_slab).min(self.chunks.len());
-            for c in begin..end {
-                let v = &self.chunks[c][first * CHUNK..self.n_panels * CHUNK];
-                let w = &panel[c * CHUNK..(c + 1) * CHUNK];
-                arch.dispatch(Project {
-                    v,
-                    w,
-                    tiles: &mut tiles,
-                });
-            }
-            tiles
-        };
-        let mut total = vec![ZERO_TILE; n_tiles];
-        let mut add = |part: Vec<Tile>| {
-            for (t, p) in total.iter_mut().zip(&part) {
-                add_tile(t, p);
-            }
-        };
-        if self.parallel {
-            let parts: Vec<Vec<Tile>> = (0..n_slabs).into_par_iter().map(slab).collect();
-            parts.into_iter().for_each(add);
-        } else {
-            (0..n_slabs).for_each(|s| add(slab(s)));
-        }
-        total
-    }
-
-    /// `W += Σ_j V_j C_j` over the panels `j >= first`; `tiles` holds the `C_j`.
-    pub fn add_combination(&self, first: usize, tiles: &[Tile], panel: &mut [Row]) {
-        let arch = Arch::new();
-        let body = |(c, w): (usize, &mut [Row])| {
-            let v = &self.chunks[c][first * CHUNK..self.n_panels * CHUNK];
-            arch.dispatch(AddCombination { v, tiles, w });
-        };
-        if self.parallel {
-            panel.par_chunks_exact_mut(CHUNK).enumerate().for_each(body);
-        } else {
-            panel.chunks_exact_mut(CHUNK).enumerate().for_each(body);
-        }
-    }
-
-    /// Removes from `panel` its components along all panels from `first` on; returns `V_jᵀ W`.
-    pub fn remove(&self, first: usize, panel: &mut [Row]) -> Vec<Tile> {
-        let tiles = self.project(first, panel);
-        let negative: Vec<Tile> = tiles.iter().map(negated).collect();
-        self.add_combination(first, &negative, panel);
-        tiles
-    }
-
-    /// New panels `X_p = Σ_j V_j C_pj`, where `coefficients[p][j]` is `C_pj`.
-    pub fn combinations(&self, coefficients: &[Vec<Tile>]) -> Vec<Vec<Row>> {
-        let arch = Arch::new();
-        let n_out = coefficients.len();
-        let n_rows = self.chunks.len() * CHUNK;
-        let mut out: Vec<Vec<Row>> = (0..n_out).map(|_| Vec::with_capacity(n_rows)).collect();
-        let mut scratch =
-            vec![vec![Row::ZERO; n_out * CHUNK]; if self.parallel { BATCH } else { 1 }];
-        let body = |(x, v): (&mut Vec<Row>, &Vec<Row>)| {
-            x.fill(Row::ZERO);
-            for (tiles, w) in coefficients.iter().zip(x.chunks_exact_mut(CHUNK)) {
-                arch.dispatch(AddCombination {
-                    v: &v[..self.n_panels * CHUNK],
-                    tiles,
-                    w,
-                });
-            }
-        };
-        for batch in self.chunks.chunks(scratch.len()) {
-            if self.parallel {
-                scratch.par_iter_mut().zip(batch).for_each(body);
-            } else {
-                scratch.iter_mut().zip(batch).for_each(body);
-            }
-            for x in &scratch[..batch.len()] {
-                for (panel, rows) in out.iter_mut().zip(x.chunks_exact(CHUNK)) {
-                    panel.extend_from_slice(rows);
-                }
-            }
-        }
-        out
-    }
-}
-
-fn add_tile(total: &mut Tile, part: &Tile) {
+pub(super) fn add_tile(total: &mut Tile, part: &Tile) {
     for (t, p) in total.iter_mut().zip(part) {
         for (x, y) in t.0.iter_mut().zip(&p.0) {
             *x += y;
@@ -214,101 +79,164 @@ pub fn tile_product(a: &Tile, b: &Tile) -> Tile {
 }
 
 /// `VᵀW` of two panels.
-pub fn gram(v: &[Row], w: &[Row]) -> Tile {
+pub fn gram(v: &[Row], w: &[Row], parallel: bool) -> Tile {
     let arch = Arch::new();
-    let per_slab = (v.len() / CHUNK).div_ceil(SLABS).max(1) * CHUNK;
-    let mut total = ZERO_TILE;
-    for (vs, ws) in v.chunks(per_slab).zip(w.chunks(per_slab)) {
-        let mut part = [ZERO_TILE];
-        for (v, w) in vs.chunks_exact(CHUNK).zip(ws.chunks_exact(CHUNK)) {
-            arch.dispatch(Project {
-                v,
-                w,
-                tiles: &mut part,
-            });
+    let per_slab = (v.len() / PADDING).div_ceil(SLABS).max(1) * PADDING;
+    let slab = |(vs, ws): (&[Row], &[Row])| {
+        let mut part = [vec![ZERO_TILE]];
+        for (v, w) in vs.chunks_exact(PADDING).zip(ws.chunks_exact(PADDING)) {
+            let v = std::array::from_fn(|i| &v[i * CHUNK..(i + 1) * CHUNK]);
+            let tiles = &mut part;
+            arch.dispatch(Project { v, w: [w], tiles });
         }
-        add_tile(&mut total, &part[0]);
+        part[0][0]
+    };
+    let mut total = ZERO_TILE;
+    let mut add = |part: Tile| add_tile(&mut total, &part);
+    if parallel {
+        let slabs = v.par_chunks(per_slab).zip(w.par_chunks(per_slab));
+        let parts: Vec<Tile> = slabs.map(slab).collect();
+        parts.into_iter().for_each(add);
+    } else {
+        let slabs = v.chunks(per_slab).zip(w.chunks(per_slab));
+        slabs.for_each(|s| add(slab(s)));
     }
     total
 }
 
-/// `W ← W C`.
-pub fn multiply_in_place(panel: &mut [Row], tile: &Tile) {
+/// `W += V C`.
+pub fn add_product(v: &[Row], tile: &Tile, w: &mut [Row], parallel: bool) {
     let arch = Arch::new();
-    let tiles = [*tile];
-    let mut copy = [Row::ZERO; CHUNK];
-    for w in panel.chunks_exact_mut(CHUNK) {
-        copy.copy_from_slice(w);
-        w.fill(Row::ZERO);
-        arch.dispatch(AddCombination {
-            v: &copy,
-            tiles: &tiles,
-            w,
-        });
+    let tiles = std::slice::from_ref(tile);
+    let body = |(v, w): (&[Row], &mut [Row])| {
+        for (v, w) in v.chunks_exact(CHUNK).zip(w.chunks_exact_mut(CHUNK)) {
+            arch.dispatch(AddCombination { v, tiles, w });
+        }
+    };
+    if parallel {
+        let pieces = v.par_chunks(PIECE).zip(w.par_chunks_mut(PIECE));
+        pieces.for_each(body);
+    } else {
+        body((v, w));
     }
 }
 
-/// Rows (or columns) a kernel keeps in registers: 6 × 2 vectors are 12 accumulators, which with two
-/// loads and a broadcast fit into 16 registers and hide the latency of the multiply-add.
-const HELD: usize = 6;
-
-/// Rows that a projection takes before the next columns of the same rows: a divisor of [`CHUNK`].
-const BURST: usize = 24;
-
-struct Project<'a> {
-    v: &'a [Row],
-    w: &'a [Row],
-    tiles: &'a mut [Tile],
+/// `W ← W C`.
+pub fn multiply_in_place(panel: &mut [Row], tile: &Tile, parallel: bool) {
+    let arch = Arch::new();
+    let tiles = std::slice::from_ref(tile);
+    let body = |w: &mut [Row]| {
+        let mut copy = [Row::ZERO; CHUNK];
+        for w in w.chunks_exact_mut(CHUNK) {
+            copy.copy_from_slice(w);
+            w.fill(Row::ZERO);
+            let v = &copy;
+            arch.dispatch(AddCombination { v, tiles, w });
+        }
+    };
+    if parallel {
+        panel.par_chunks_mut(PIECE).for_each(body);
+    } else {
+        body(panel);
+    }
 }
 
-impl WithSimd for Project<'_> {
+/// Whether two vectors fit into a row; otherwise (8 numbers a vector) a row is one.
+#[inline(always)]
+pub(super) fn paired<S: Simd>() -> bool {
+    2 * S::F64_LANES <= WIDTH
+}
+
+/// Vectors `V h..V h + V` of a row.
+#[inline(always)]
+pub(super) fn load<S: Simd, const V: usize>(row: &[f64], h: usize) -> [S::f64s; V] {
+    let (vectors, _) = S::as_simd_f64s(row);
+    std::array::from_fn(|v| vectors[V * h + v])
+}
+
+/// Replaces vectors `V h..V h + V` of a row.
+#[inline(always)]
+pub(super) fn store<S: Simd, const V: usize>(row: &mut [f64], h: usize, x: [S::f64s; V]) {
+    let (vectors, _) = S::as_mut_simd_f64s(row);
+    vectors[V * h..V * h + V].copy_from_slice(&x);
+}
+
+/// `a + l b`.
+#[inline(always)]
+pub(super) fn add_scaled<S: Simd, const V: usize>(
+    simd: S,
+    a: [S::f64s; V],
+    l: f64,
+    b: [S::f64s; V],
+) -> [S::f64s; V] {
+    let l = simd.splat_f64s(l);
+    std::array::from_fn(|v| simd.mul_add_e_f64s(l, b[v], a[v]))
+}
+
+/// `C_j += V_jᵀ W` for a burst of chunks of every panel.
+pub(super) struct Project<'a, const N: usize> {
+    pub(super) v: [&'a [Row]; BURST],
+    pub(super) w: [&'a [Row]; N],
+    pub(super) tiles: &'a mut [Vec<Tile>; N],
+}
+
+impl<const N: usize> WithSimd for Project<'_, N> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        for (v, tile) in self.v.chunks_exact(CHUNK).zip(self.tiles) {
-            // Few rows at a time, so that the stream from memory is spread over all passes.
-            for (v, w) in v.chunks_exact(BURST).zip(self.w.chunks_exact(BURST)) {
-                for h in 0..WIDTH / (2 * S::F64_LANES) {
-                    project_columns::<S, 0, HELD>(simd, v, w, h, tile);
-                    project_columns::<S, 6, 5>(simd, v, w, h, tile);
-                    project_columns::<S, 11, 5>(simd, v, w, h, tile);
+        let v: [&[[Row; CHUNK]]; BURST] = self.v.map(|v| v.as_chunks().0);
+        let w: [&[[Row; CHUNK]]; N] = self.w.map(|w| w.as_chunks().0);
+        for j in 0..v[0].len() {
+            let v = v.map(|v| &v[j]);
+            for (tiles, w) in self.tiles.iter_mut().zip(w) {
+                let tile = &mut tiles[j];
+                if paired::<S>() {
+                    for h in 0..WIDTH / (2 * S::F64_LANES) {
+                        project_columns::<S, 2, 0, 4>(simd, v, w, h, tile);
+                        project_columns::<S, 2, 4, 4>(simd, v, w, h, tile);
+                    }
+                } else {
+                    project_columns::<S, 1, 0, WIDTH>(simd, v, w, 0, tile);
                 }
             }
         }
     }
 }
 
-/// Rows `Q..Q + B` of `C += VᵀW`, in the `h`-th pair of vectors of columns.
+/// Rows `Q..Q + B` of `C += VᵀW`, in vectors `X h..X h + X` of columns.
 #[inline(always)]
-fn project_columns<S: Simd, const Q: usize, const B: usize>(
+fn project_columns<S: Simd, const X: usize, const Q: usize, const B: usize>(
     simd: S,
-    v: &[Row],
-    w: &[Row],
+    v: [&[Row; CHUNK]; BURST],
+    w: &[[Row; CHUNK]],
     h: usize,
     tile: &mut Tile,
 ) {
-    let mut acc = [[simd.splat_f64s(0.0); 2]; B];
-    for (vr, wr) in v.iter().zip(w) {
-        let (ws, _) = S::as_simd_f64s(&wr.0);
-        let (w0, w1) = (ws[2 * h], ws[2 * h + 1]);
-        for b in 0..B {
-            let x = simd.splat_f64s(vr.0[Q + b]);
-            acc[b][0] = simd.mul_add_e_f64s(x, w0, acc[b][0]);
-            acc[b][1] = simd.mul_add_e_f64s(x, w1, acc[b][1]);
+    let mut acc = [[simd.splat_f64s(0.0); X]; B];
+    for (v, w) in v.into_iter().zip(w) {
+        for (vr, wr) in v.iter().zip(w) {
+            let w = load::<S, X>(&wr.0, h);
+            for b in 0..B {
+                acc[b] = add_scaled(simd, acc[b], vr.0[Q + b], w);
+            }
         }
     }
     for (row, a) in tile[Q..Q + B].iter_mut().zip(acc) {
-        let (out, _) = S::as_mut_simd_f64s(&mut row.0);
-        out[2 * h] = simd.add_f64s(out[2 * h], a[0]);
-        out[2 * h + 1] = simd.add_f64s(out[2 * h + 1], a[1]);
+        let c = load::<S, X>(&row.0, h);
+        store::<S, X>(
+            &mut row.0,
+            h,
+            std::array::from_fn(|x| simd.add_f64s(c[x], a[x])),
+        );
     }
 }
 
-struct AddCombination<'a> {
-    v: &'a [Row],
-    tiles: &'a [Tile],
-    w: &'a mut [Row],
+/// `W += Σ_j V_j C_j` for one chunk.
+pub(super) struct AddCombination<'a> {
+    pub(super) v: &'a [Row],
+    pub(super) tiles: &'a [Tile],
+    pub(super) w: &'a mut [Row],
 }
 
 impl WithSimd for AddCombination<'_> {
@@ -316,38 +244,38 @@ impl WithSimd for AddCombination<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        for (v, tile) in self.v.chunks_exact(CHUNK).zip(self.tiles) {
-            let (v_groups, _) = v.as_chunks::<HELD>();
-            let (w_groups, _) = self.w.as_chunks_mut::<HELD>();
-            for (vg, wg) in v_groups.iter().zip(w_groups) {
-                for h in 0..WIDTH / (2 * S::F64_LANES) {
-                    add_rows(simd, vg, tile, h, wg);
-                }
+        let w = self.w.first_chunk_mut().expect("invariant: w is one chunk");
+        if paired::<S>() {
+            for h in 0..WIDTH / (2 * S::F64_LANES) {
+                add_rows::<S, 2>(simd, self.v, self.tiles, h, w);
             }
+        } else {
+            add_rows::<S, 1>(simd, self.v, self.tiles, 0, w);
         }
     }
 }
 
-/// `W += V C` for a group of rows, in the `h`-th pair of vectors of columns.
+/// `W += Σ_j V_j C_j`, in vectors `X h..X h + X` of columns: 6 rows of two vectors are 12
+/// accumulators, which with the vectors they are made from fit into 16 registers and hide the
+/// latency of the multiply-add.
 #[inline(always)]
-fn add_rows<S: Simd>(simd: S, v: &[Row; HELD], tile: &Tile, h: usize, w: &mut [Row; HELD]) {
-    let mut acc = [[simd.splat_f64s(0.0); 2]; HELD];
-    for (a, row) in acc.iter_mut().zip(w.iter()) {
-        let (ws, _) = S::as_simd_f64s(&row.0);
-        *a = [ws[2 * h], ws[2 * h + 1]];
-    }
-    for q in 0..WIDTH {
-        let (cs, _) = S::as_simd_f64s(&tile[q].0);
-        let (c0, c1) = (cs[2 * h], cs[2 * h + 1]);
-        for i in 0..HELD {
-            let x = simd.splat_f64s(v[i].0[q]);
-            acc[i][0] = simd.mul_add_e_f64s(x, c0, acc[i][0]);
-            acc[i][1] = simd.mul_add_e_f64s(x, c1, acc[i][1]);
+fn add_rows<S: Simd, const X: usize>(
+    simd: S,
+    v: &[Row],
+    tiles: &[Tile],
+    h: usize,
+    w: &mut [Row; CHUNK],
+) {
+    let mut acc: [[S::f64s; X]; CHUNK] = std::array::from_fn(|b| load::<S, X>(&w[b].0, h));
+    for (v, tile) in v.as_chunks::<CHUNK>().0.iter().zip(tiles) {
+        for q in 0..WIDTH {
+            let c = load::<S, X>(&tile[q].0, h);
+            for b in 0..CHUNK {
+                acc[b] = add_scaled(simd, acc[b], v[b].0[q], c);
+            }
         }
     }
-    for (a, row) in acc.iter().zip(w.iter_mut()) {
-        let (ws, _) = S::as_mut_simd_f64s(&mut row.0);
-        ws[2 * h] = a[0];
-        ws[2 * h + 1] = a[1];
+    for (row, a) in w.iter_mut().zip(acc) {
+        store::<S, X>(&mut row.0, h, a);
     }
 }

@@ -1,8 +1,11 @@
 //! The parts of the eigen solver against plain loops.
 
+use super::basis::Basis;
 use super::dense_eigen::symmetric_eigen;
-use super::ldlt::{Analysis, Factor, LdltError, SymmetricSparse};
-use super::panel::{Basis, CHUNK, Row, WIDTH, gram, zero_panel};
+use super::ldlt::{Analysis, Factor, Inertia, LdltError, SymmetricSparse};
+use super::panel::{
+    PADDING, Row, Tile, WIDTH, add_product, gram, multiply_in_place, negated, zero_panel,
+};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
@@ -49,16 +52,18 @@ fn random_matrix(n: usize, random: &mut Pcg64) -> (SymmetricSparse, Vec<f64>) {
 #[test]
 fn products_of_panels_are_those_of_plain_loops() {
     let mut random = Pcg64::seed_from_u64(1);
-    for n in [1, 95, CHUNK, 1_000] {
+    for n in [1, 95, PADDING, 3_000] {
         for parallel in [false, true] {
             let panels: Vec<_> = (0..3).map(|_| random_panel(n, &mut random)).collect();
             let w = random_panel(n, &mut random);
-            let mut basis = Basis::new(n, 3, parallel);
+            // Room for one panel: the others make it grow.
+            let mut basis = Basis::new(n, 1, parallel);
             panels.iter().for_each(|p| basis.push(p));
             assert_eq!(basis.panel(1), panels[1]);
-            let tiles = basis.project(1, &w);
+            let [tiles] = basis.project(1, [&w]);
             assert_eq!(tiles.len(), 2);
-            assert_eq!(gram(&panels[2], &w), tiles[1]);
+            assert_eq!(gram(&panels[2], &w, parallel), tiles[1]);
+            assert_eq!(basis.project(1, [&panels[0], &w])[1], tiles);
             for (tile, v) in tiles.iter().zip(&panels[1..]) {
                 for (i, row) in tile.iter().enumerate() {
                     for (j, found) in row.0.iter().enumerate() {
@@ -67,20 +72,72 @@ fn products_of_panels_are_those_of_plain_loops() {
                     }
                 }
             }
-            let sum = &basis.combinations(&[basis.project(0, &w)])[0];
-            let mut added = w.clone();
-            basis.add_combination(0, &basis.project(0, &w), &mut added);
-            for ((s, a), w) in sum.iter().zip(&added).zip(&w) {
+            let [tiles] = basis.project(0, [&w]);
+            let (mut added, mut other) = (w.clone(), w.clone());
+            basis.add_combination(0, [&tiles, &tiles], [&mut added, &mut other]);
+            assert_eq!(added, other);
+            let mut product = w.clone();
+            add_product(&panels[0], &tiles[0], &mut product, parallel);
+            let mut combined = basis;
+            combined.transform(&[tiles.clone(), tiles]);
+            assert_eq!(combined.n_panels(), 2);
+            assert_eq!(combined.panel(0), combined.panel(1));
+            let sum = combined.panel(0);
+            for (i, (s, a)) in sum.iter().zip(&added).enumerate() {
                 for j in 0..WIDTH {
-                    assert!((a.0[j] - w.0[j] - s.0[j]).abs() < ROUNDING * n as f64);
+                    assert!((a.0[j] - w[i].0[j] - s.0[j]).abs() < ROUNDING * n as f64);
                 }
             }
-            assert!(
-                sum[n..].iter().all(|row| *row == Row::ZERO),
-                "padding stays zero"
-            );
+            let padding = sum[n..].iter().chain(&product[n..]);
+            assert!(padding.into_iter().all(|row| *row == Row::ZERO));
+            let mut alone = panels[0].clone();
+            multiply_in_place(&mut alone, &negated(&identity_tile()), parallel);
+            let negative = |(a, b): (&Row, &Row)| a.0 == b.0.map(|x| -x);
+            assert!(alone.iter().zip(&panels[0]).all(negative));
         }
     }
+}
+
+fn identity_tile() -> Tile {
+    std::array::from_fn(|i| Row(std::array::from_fn(|j| f64::from(u8::from(i == j)))))
+}
+
+#[test]
+fn columns_are_gathered_from_several_bases() {
+    let mut random = Pcg64::seed_from_u64(3);
+    let n = 50;
+    let make = |random: &mut Pcg64| {
+        let mut basis = Basis::new(n, 2, false);
+        basis.push(&random_panel(n, random));
+        basis.push(&random_panel(n, random));
+        basis
+    };
+    let (a, b) = (make(&mut random), make(&mut random));
+    let columns = [
+        (1, 9),
+        (0, 0),
+        (0, 15),
+        (1, 8),
+        (0, 3),
+        (1, 1),
+        (0, 2),
+        (1, 2),
+        (1, 15),
+    ];
+    let gathered = Basis::of_columns(n, false, &[&a, &b], &columns);
+    assert_eq!(gathered.n_panels(), 2);
+    for (to, &(source, from)) in columns.iter().enumerate() {
+        let from_panel = [&a, &b][source].panel(from / WIDTH);
+        for (found, row) in gathered.panel(to / WIDTH).iter().zip(&from_panel) {
+            assert_eq!(found.0[to % WIDTH], row.0[from % WIDTH]);
+        }
+    }
+    assert!(
+        gathered
+            .panel(1)
+            .iter()
+            .all(|row| row.0[1..] == [0.0; WIDTH - 1])
+    );
 }
 
 #[test]
@@ -94,12 +151,17 @@ fn factors_solve_and_count() {
         for shift in [-100.0, -0.31, 0.4, 1.7, 100.0] {
             let factor = Factor::new(&analysis, &permuted, shift).unwrap();
             assert_eq!(
-                factor.n_negative,
+                factor.inertia.n_negative,
                 eigenvalues.iter().filter(|l| **l < shift).count()
             );
+            let counted = Inertia::new(&analysis, &permuted, shift).unwrap();
+            assert_eq!(counted, factor.inertia);
             let b = random_panel(n, &mut random);
             let mut x = b.clone();
-            factor.solve(&mut x);
+            factor.solve(&mut x, false);
+            let mut shared = b.clone();
+            factor.solve(&mut shared, true);
+            assert_eq!(shared, x);
             // Backward error: the residual against the bound on the perturbation.
             for i in 0..n {
                 let (columns, values) = permuted.row(i);
@@ -112,7 +174,7 @@ fn factors_solve_and_count() {
                     let r = sx - shift * x[i].0[j] - b[i].0[j];
                     let size = x.iter().map(|row| row.0[j].abs()).fold(1.0, f64::max);
                     assert!(
-                        r.abs() <= 10.0 * factor.perturbation * size + ROUNDING,
+                        r.abs() <= 10.0 * factor.inertia.perturbation * size + ROUNDING,
                         "{r}"
                     );
                 }

@@ -1,8 +1,10 @@
 //! A stiffness and a mass become connected components, each in standard form.
 
 use super::SpectrumError;
-use crate::linalg::ldlt::{Analysis, Factor, LdltError, SymmetricSparse};
+use crate::linalg::basis::Basis;
+use crate::linalg::ldlt::{Analysis, Factor, Inertia, LdltError, SymmetricSparse};
 use crate::linalg::panel::{Row, WIDTH};
+use pulp::Arch;
 
 /// A row sum of W below this share of the row's absolute sum is rounding of an exact zero.
 const ROW_SUM_ROUNDING: f64 = 1e-13;
@@ -39,68 +41,100 @@ impl Component {
         self.vertices.len()
     }
 
-    /// The unit null vector of S, by row.
-    pub(super) fn null_vector(&self) -> impl Iterator<Item = f64> + '_ {
+    /// (vertex, row) in ascending order of the vertices.
+    pub(super) fn rows_by_vertex(&self) -> Vec<(u32, u32)> {
+        let rows = self.vertices.iter().zip(0..);
+        let mut out: Vec<_> = rows.map(|(&v, row)| (v, row)).collect();
+        out.sort_unstable();
+        out
+    }
+
+    /// Puts the unit null vector of S into the first column.
+    pub(super) fn set_null_vector(&self, vectors: &mut Basis) {
         let scale = self.area.sqrt();
-        self.inverse_sqrt_mass
-            .iter()
-            .map(move |x| 1.0 / (x * scale))
+        let rows = vectors.rows_of_mut(0).flatten();
+        for (row, x) in rows.zip(&self.inverse_sqrt_mass) {
+            row.0[0] = 1.0 / (x * scale);
+        }
     }
 
     /// Factorises `S - shift I`; moves the shift up a little where it hits a pivot exactly.
     pub(super) fn factor(&self, shift: f64) -> Result<(Factor, f64), LdltError> {
-        let mut moved = shift;
-        for attempt in 1..=8 {
-            match Factor::new(&self.analysis, &self.standard, moved) {
-                Err(LdltError::ZeroPivot { .. }) if attempt < 8 => {
-                    moved = shift + f64::from(attempt) * NUDGE * shift.abs();
-                }
-                other => return other.map(|factor| (factor, moved)),
-            }
-        }
-        unreachable!("the last attempt returns")
+        off_pivots(shift, |at| Factor::new(&self.analysis, &self.standard, at))
     }
 
-    /// Rayleigh quotients λ and residuals `‖S x - λ x‖` of 16 unit vectors. W is applied to
-    /// differences along edges, so that large weights of sliver triangles do not amplify the
-    /// rounding of a sum that cancels.
-    pub(super) fn rayleigh(&self, x: &[Row]) -> ([f64; WIDTH], [f64; WIDTH]) {
-        let phi: Vec<Row> = x
-            .iter()
-            .zip(&self.inverse_sqrt_mass)
-            .map(|(row, s)| Row(row.0.map(|v| v * s)))
-            .collect();
-        let mut quotients = [0.0; WIDTH];
-        let mut images = Vec::with_capacity(self.n());
-        for (i, (&scale, &row_sum)) in self
-            .inverse_sqrt_mass
-            .iter()
-            .zip(&self.row_sums)
-            .enumerate()
-        {
-            let (columns, values) = self.stiffness.row(i);
-            let own = phi[i].0;
-            let mut image = own.map(|v| v * row_sum);
-            for (&c, &w) in columns.iter().zip(values) {
-                for ((a, o), p) in image.iter_mut().zip(&own).zip(&phi[c as usize].0) {
-                    *a += w * (p - o);
+    /// Counts the eigenvalues of S below `shift`, moved as for [`Component::factor`].
+    pub(super) fn inertia(&self, shift: f64) -> Result<(Inertia, f64), LdltError> {
+        off_pivots(shift, |at| Inertia::new(&self.analysis, &self.standard, at))
+    }
+
+    /// Rayleigh quotients λ and residuals `‖S x - λ x‖` of the unit vectors of panel `j`. W is
+    /// applied to differences along edges, so that large weights of sliver triangles do not amplify
+    /// the rounding of a sum that cancels.
+    pub(super) fn rayleigh(
+        &self,
+        vectors: &Basis,
+        j: usize,
+        scratch: &mut Scratch,
+    ) -> ([f64; WIDTH], [f64; WIDTH]) {
+        let Scratch { x, phi, images } = scratch;
+        vectors.copy_panel(j, x);
+        phi.clear();
+        images.clear();
+        Arch::new().dispatch(|| {
+            let scaled = x.iter().zip(&self.inverse_sqrt_mass);
+            phi.extend(scaled.map(|(row, s)| Row(row.0.map(|v| v * s))));
+            let mut quotients = [0.0; WIDTH];
+            for (i, x) in x[..self.n()].iter().enumerate() {
+                let (columns, values) = self.stiffness.row(i);
+                let own = phi[i].0;
+                let mut image = own.map(|v| v * self.row_sums[i]);
+                for (&c, &w) in columns.iter().zip(values) {
+                    for ((a, o), p) in image.iter_mut().zip(&own).zip(&phi[c as usize].0) {
+                        *a += w * (p - o);
+                    }
+                }
+                for ((q, a), v) in quotients.iter_mut().zip(&mut image).zip(&x.0) {
+                    *a *= self.inverse_sqrt_mass[i];
+                    *q += *a * v;
+                }
+                images.push(Row(image));
+            }
+            let mut sums = [0.0; WIDTH];
+            for (image, x) in images.iter().zip(x) {
+                for (((s, a), v), l) in sums.iter_mut().zip(&image.0).zip(&x.0).zip(&quotients) {
+                    let r = a - l * v;
+                    *s += r * r;
                 }
             }
-            for ((q, a), v) in quotients.iter_mut().zip(&mut image).zip(&x[i].0) {
-                *a *= scale;
-                *q += *a * v;
-            }
-            images.push(Row(image));
-        }
-        let mut sums = [0.0; WIDTH];
-        for (image, v) in images.iter().zip(x) {
-            for (((s, a), v), l) in sums.iter_mut().zip(&image.0).zip(&v.0).zip(&quotients) {
-                let r = a - l * v;
-                *s += r * r;
-            }
-        }
-        (quotients, sums.map(f64::sqrt))
+            (quotients, sums.map(f64::sqrt))
+        })
     }
+}
+
+/// Calls `factorise` at `shift`, or a little above it where that hits a pivot exactly.
+fn off_pivots<T>(
+    shift: f64,
+    factorise: impl Fn(f64) -> Result<T, LdltError>,
+) -> Result<(T, f64), LdltError> {
+    let mut moved = shift;
+    for attempt in 1..=8 {
+        match factorise(moved) {
+            Err(LdltError::ZeroPivot { .. }) if attempt < 8 => {
+                moved = shift + f64::from(attempt) * NUDGE * shift.abs();
+            }
+            other => return other.map(|found| (found, moved)),
+        }
+    }
+    unreachable!("the last attempt returns")
+}
+
+/// Memory of [`Component::rayleigh`], for one panel after the other.
+#[derive(Default)]
+pub(super) struct Scratch {
+    x: Vec<Row>,
+    phi: Vec<Row>,
+    images: Vec<Row>,
 }
 
 /// Checks both matrices.

@@ -5,8 +5,9 @@ use super::component::Component;
 use super::iterative::{Lanczos, first_dimension};
 use super::polish::verify_and_polish;
 use super::{Hook, SpectrumError};
+use crate::linalg::basis::Basis;
 use crate::linalg::dense_eigen::symmetric_eigen;
-use crate::linalg::panel::{Row, WIDTH, zero_panel};
+use crate::linalg::panel::{WIDTH, zero_panel};
 
 /// Components up to this size are solved densely.
 const DENSE_ALWAYS: usize = 160;
@@ -20,8 +21,8 @@ pub(super) struct Pairs {
     pub(super) values: Vec<f64>,
     /// `‖S x - λ x‖` of each.
     pub(super) residuals: Vec<f64>,
-    /// Orthonormal eigenvectors of S, 16 a panel, rows in elimination order.
-    pub(super) panels: Vec<Vec<Row>>,
+    /// Orthonormal eigenvectors of S, rows in elimination order.
+    pub(super) vectors: Basis,
     /// Every eigenvalue below this is among `values`.
     pub(super) limit: f64,
     /// Distance from `limit` to the nearest eigenvalue found.
@@ -103,7 +104,7 @@ pub(super) fn dense(
         values[0] = 0.0;
     }
     let (j, limit, margin) = gap_after(&values, k, n).unwrap_or((n, f64::INFINITY, f64::INFINITY));
-    let mut panels = Vec::with_capacity(j.div_ceil(WIDTH));
+    let mut basis = Basis::new(n, j.div_ceil(WIDTH), setting.parallel);
     for first in (0..j).step_by(WIDTH) {
         let mut panel = zero_panel(n);
         for column in first..(first + WIDTH).min(j) {
@@ -111,18 +112,16 @@ pub(super) fn dense(
                 row.0[column - first] = vectors[(i, column)];
             }
         }
-        panels.push(panel);
+        basis.push(&panel);
     }
     if component.has_null_vector {
-        for (row, x) in panels[0].iter_mut().zip(component.null_vector()) {
-            row.0[0] = x;
-        }
+        component.set_null_vector(&mut basis);
     }
     values.truncate(j);
     let mut pairs = Pairs {
         values,
         residuals: Vec::new(),
-        panels,
+        vectors: basis,
         limit,
         margin,
         perturbation: n as f64 * f64::EPSILON * largest,

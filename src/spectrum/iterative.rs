@@ -5,9 +5,10 @@ use super::SpectrumError;
 use super::component::Component;
 use super::connected::{Pairs, Setting, dense, gap_after};
 use super::polish::verify_and_polish;
+use crate::linalg::basis::Basis;
 use crate::linalg::block_lanczos::{BlockLanczos, Projection};
 use crate::linalg::ldlt::Factor;
-use crate::linalg::panel::{Basis, Row, WIDTH, zero_panel};
+use crate::linalg::panel::{Row, WIDTH, zero_panel};
 
 /// Rounds in which eigenvalues that the count says are missing are looked for.
 const MAX_REPAIR: usize = 12;
@@ -27,7 +28,7 @@ const MOST_BELOW: f64 = 0.65;
 /// Vectors after which k pairs have usually converged to 1e-8, by experiment on surfaces. A second
 /// look at a space that is too small costs more than a few vectors too many.
 pub(super) fn first_dimension(k: usize) -> usize {
-    (k * 33 / 20 + 170).next_multiple_of(WIDTH)
+    (k * 31 / 20 + 96).next_multiple_of(WIDTH)
 }
 
 /// Blocks after which residuals that are `worst` times too large will do: each block divides them by
@@ -64,7 +65,7 @@ impl Lanczos<'_> {
         for _ in 0..60 {
             self.setting.hook.enter("factor")?;
             let (factor, at) = self.component.factor(shift)?;
-            let count = factor.n_negative as f64;
+            let count = factor.inertia.n_negative as f64;
             if count >= FEWEST_BELOW * k && count <= (MOST_BELOW * k).max(1.0) {
                 return Ok((factor, at));
             }
@@ -81,7 +82,7 @@ impl Lanczos<'_> {
                 true => (low * high).sqrt(),
                 false => aimed,
             };
-            let usable = factor.n_negative < k as usize;
+            let usable = factor.inertia.n_negative < k as usize;
             if usable {
                 best = Some((factor, at));
             }
@@ -102,16 +103,16 @@ impl Lanczos<'_> {
         // At least three pairs, so that a shift fits between them.
         let (factor, shift) = self.interior_shift(k.max(3))?;
         let mut locked = Basis::new(n, 1, self.setting.parallel);
-        let null = self.null_panel();
-        if let Some(panel) = &null {
-            locked.push(panel);
+        if self.component.has_null_vector {
+            locked.push(&zero_panel(n));
+            self.component.set_null_vector(&mut locked);
         }
-        let n_below = factor.n_negative.saturating_sub(self.n_null());
+        let n_below = factor.inertia.n_negative.saturating_sub(self.n_null());
         let capacity = ((n - self.n_null()) / WIDTH - 2).min((MOST_VECTORS * k + 1_600) / WIDTH);
         let mut space = BlockLanczos::new(
             n,
             &locked,
-            capacity.min((2 * k + 400) / WIDTH) + 1,
+            capacity.min(first_dimension(k) / WIDTH) + 1,
             self.setting.seed,
             self.setting.parallel,
         )?;
@@ -119,7 +120,7 @@ impl Lanczos<'_> {
         let (ritz, projection, below) = loop {
             hook.enter("iterate")?;
             while space.dimension() < target {
-                space.step(&|panel: &mut [Row]| factor.solve(panel))?;
+                space.step(&|panel: &mut [Row]| factor.solve(panel, self.setting.parallel))?;
                 hook.enter("iterate")?;
             }
             hook.enter("check")?;
@@ -150,23 +151,26 @@ impl Lanczos<'_> {
         hook.enter("vectors")?;
         let n_krylov = space.dimension();
         let count = below - self.n_null();
-        let chosen: Vec<usize> = ritz.pairs[..count].iter().map(|p| p.1).collect();
-        let panels = space.vectors(&projection, &chosen);
-        let mut values: Vec<f64> = ritz.pairs[..count].iter().map(|p| p.0).collect();
-        let panels = match null {
-            None => panels,
-            Some(null) => {
-                values.insert(0, 0.0);
-                with_first_column(&null, &panels, values.len())
-            }
-        };
+        let found = &ritz.pairs[..count];
+        let null = self.component.has_null_vector;
+        let chosen: Vec<Option<usize>> = null
+            .then_some(None)
+            .into_iter()
+            .chain(found.iter().map(|p| Some(p.1)))
+            .collect();
+        let values = null.then_some(0.0).into_iter();
+        let values = values.chain(found.iter().map(|p| p.0)).collect();
+        let mut vectors = space.vectors(&projection, &chosen);
+        if null {
+            self.component.set_null_vector(&mut vectors);
+        }
         let (_, limit, margin) = self
             .gap(&ritz, k)
             .ok_or(SpectrumError::NoGap { k, n_krylov })?;
         let mut pairs = Pairs {
             values,
             residuals: Vec::new(),
-            panels,
+            vectors,
             limit,
             margin,
             perturbation: 0.0,
@@ -177,16 +181,6 @@ impl Lanczos<'_> {
         self.complete(&factor, shift, &mut pairs)?;
         verify_and_polish(self.component, self.setting, &mut pairs)?;
         Ok(pairs)
-    }
-
-    fn null_panel(&self) -> Option<Vec<Row>> {
-        self.component.has_null_vector.then(|| {
-            let mut panel = zero_panel(self.component.n());
-            for (row, x) in panel.iter_mut().zip(self.component.null_vector()) {
-                row.0[0] = x;
-            }
-            panel
-        })
     }
 
     fn ritz(&self, projection: &Projection, shift: f64) -> Ritz {
@@ -235,10 +229,9 @@ impl Lanczos<'_> {
         shift: f64,
         pairs: &mut Pairs,
     ) -> Result<(), SpectrumError> {
-        let n = self.component.n();
         for round in 0..=MAX_REPAIR {
             self.setting.hook.enter("certify")?;
-            let (at_limit, limit) = self.component.factor(pairs.limit)?;
+            let (at_limit, limit) = self.component.inertia(pairs.limit)?;
             pairs.limit = limit;
             pairs.perturbation = at_limit.perturbation;
             let (expected, found) = (at_limit.n_negative, pairs.values.len());
@@ -252,19 +245,14 @@ impl Lanczos<'_> {
                     found,
                 });
             }
-            drop(at_limit);
             self.setting.hook.enter("repair")?;
             pairs.n_repair += 1;
-            let mut locked = Basis::new(n, pairs.panels.len(), self.setting.parallel);
-            for panel in &pairs.panels {
-                locked.push(panel);
+            let locked = &pairs.vectors;
+            let (values, vectors) =
+                self.missing(factor, shift, locked, expected - found, limit, round)?;
+            if !values.is_empty() {
+                self.merge(pairs, &values, &vectors);
             }
-            let (values, panels) =
-                self.missing(factor, shift, &locked, expected - found, limit, round)?;
-            if values.is_empty() {
-                continue;
-            }
-            merge(pairs, &values, &panels);
         }
         Ok(())
     }
@@ -278,7 +266,7 @@ impl Lanczos<'_> {
         wanted: usize,
         limit: f64,
         round: usize,
-    ) -> Result<(Vec<f64>, Vec<Vec<Row>>), SpectrumError> {
+    ) -> Result<(Vec<f64>, Basis), SpectrumError> {
         let n = self.component.n();
         let found = locked.n_panels() * WIDTH;
         let capacity = (n.saturating_sub(found) / WIDTH).saturating_sub(2);
@@ -289,7 +277,7 @@ impl Lanczos<'_> {
         loop {
             while space.dimension() < target.min(capacity * WIDTH) {
                 self.setting.hook.enter("repair")?;
-                space.step(&|panel: &mut [Row]| factor.solve(panel))?;
+                space.step(&|panel: &mut [Row]| factor.solve(panel, self.setting.parallel))?;
             }
             let projection = space.projection()?;
             let ritz = self.ritz(&projection, shift);
@@ -306,54 +294,23 @@ impl Lanczos<'_> {
                     .filter(|p| p.2 <= scale)
                     .collect();
                 let values = good.iter().map(|p| p.0).collect();
-                let chosen: Vec<usize> = good.iter().map(|p| p.1).collect();
+                let chosen: Vec<_> = good.iter().map(|p| Some(p.1)).collect();
                 return Ok((values, space.vectors(&projection, &chosen)));
             }
             target = space.dimension() + 2 * WIDTH;
         }
     }
-}
 
-/// Moves all columns of `panels` one to the right and puts column 0 of `first` before them.
-fn with_first_column(first: &[Row], panels: &[Vec<Row>], count: usize) -> Vec<Vec<Row>> {
-    let rows = first.len();
-    let mut out = vec![vec![Row::ZERO; rows]; count.div_ceil(WIDTH)];
-    for i in 0..rows {
-        let mut carried = first[i].0[0];
-        for (p, panel) in out.iter_mut().enumerate() {
-            let source = panels.get(p).map_or([0.0; WIDTH], |s| s[i].0);
-            panel[i].0[0] = carried;
-            panel[i].0[1..].copy_from_slice(&source[..WIDTH - 1]);
-            carried = source[WIDTH - 1];
-        }
+    /// Adds further pairs, in ascending order.
+    fn merge(&self, pairs: &mut Pairs, values: &[f64], vectors: &Basis) {
+        let old = pairs.values.iter().enumerate().map(|(i, &v)| (v, 0, i));
+        let new = values.iter().enumerate().map(|(i, &v)| (v, 1, i));
+        let mut order: Vec<(f64, usize, usize)> = old.chain(new).collect();
+        order.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let columns: Vec<_> = order.iter().map(|o| (o.1, o.2)).collect();
+        let sources = [&pairs.vectors, vectors];
+        let n = self.component.n();
+        pairs.vectors = Basis::of_columns(n, self.setting.parallel, &sources, &columns);
+        pairs.values = order.iter().map(|o| o.0).collect();
     }
-    out
-}
-
-/// Adds further pairs, in ascending order.
-fn merge(pairs: &mut Pairs, values: &[f64], panels: &[Vec<Row>]) {
-    let old = pairs.values.len();
-    let mut order: Vec<(f64, usize)> = pairs
-        .values
-        .iter()
-        .chain(values)
-        .copied()
-        .enumerate()
-        .map(|(i, v)| (v, i))
-        .collect();
-    order.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let rows = pairs.panels[0].len();
-    let mut out = vec![vec![Row::ZERO; rows]; order.len().div_ceil(WIDTH)];
-    for (new, &(_, from)) in order.iter().enumerate() {
-        let (source, from) = if from < old {
-            (&pairs.panels, from)
-        } else {
-            (&panels.to_vec(), from - old)
-        };
-        for (row, s) in out[new / WIDTH].iter_mut().zip(&source[from / WIDTH]) {
-            row.0[new % WIDTH] = s.0[from % WIDTH];
-        }
-    }
-    pairs.values = order.iter().map(|o| o.0).collect();
-    pairs.panels = out;
 }

@@ -4,16 +4,21 @@
 #![allow(clippy::needless_range_loop)]
 
 use super::SpectrumError;
-use super::component::Component;
+use super::component::{Component, Scratch};
 use super::connected::{Pairs, Setting};
+use crate::linalg::basis::Basis;
 use crate::linalg::dense_eigen::symmetric_eigen;
-use crate::linalg::panel::{Basis, Tile, WIDTH, ZERO_TILE};
+use crate::linalg::panel::{Row, Tile, WIDTH, negated};
+use rayon::prelude::{IntoParallelIterator, ParallelIterator};
+
+/// Pairs whose residuals are at most this share of what is allowed are left as they are.
+const GOOD_ENOUGH: f64 = 0.3;
 
 /// Rounds of inverse iteration with a definite factor before a residual is given up.
 const MAX_POLISH: usize = 4;
 
-/// Measures the residuals; while one is too large, improves all vectors by inverse iteration with a
-/// definite factor (no growth, whatever the mesh) and a Rayleigh–Ritz step.
+/// Measures the residuals; while one is too large, improves the worse ones by inverse iteration with
+/// a definite factor (no growth, whatever the mesh) and a Rayleigh–Ritz step.
 pub(super) fn verify_and_polish(
     component: &Component,
     setting: &Setting,
@@ -22,12 +27,14 @@ pub(super) fn verify_and_polish(
     let mut best = f64::INFINITY;
     for round in 0..=MAX_POLISH {
         setting.hook.enter("verify")?;
-        measure(component, pairs);
-        let (index, ratio) = worst_ratio(pairs, setting.tolerance);
+        measure(component, setting.parallel, pairs);
+        let ratios = ratios(pairs, setting.tolerance);
+        let index = worst(&ratios);
+        let ratio = ratios[index];
         if ratio <= 1.0 {
             return Ok(());
         }
-        if round == MAX_POLISH || ratio > 0.5 * best {
+        if round == MAX_POLISH || ratio.is_nan() || ratio > 0.5 * best {
             return Err(SpectrumError::Residual {
                 index,
                 eigenvalue: pairs.values[index],
@@ -38,28 +45,43 @@ pub(super) fn verify_and_polish(
         best = best.min(ratio);
         setting.hook.enter("polish")?;
         pairs.n_polish += 1;
-        polish(component, setting.parallel, pairs)?;
+        let first = usize::from(component.has_null_vector);
+        let poor = (first..ratios.len()).filter(|&i| ratios[i] > GOOD_ENOUGH);
+        polish(
+            component,
+            setting.parallel,
+            pairs,
+            &poor.collect::<Vec<_>>(),
+        )?;
     }
     Ok(())
 }
 
 /// Replaces the values by Rayleigh quotients, and measures the residuals.
-fn measure(component: &Component, pairs: &mut Pairs) {
-    pairs.residuals.clear();
-    for (panel, values) in pairs.panels.iter().zip(pairs.values.chunks_mut(WIDTH)) {
-        let (mut quotients, residuals) = component.rayleigh(panel);
-        if component.has_null_vector && pairs.residuals.is_empty() {
+fn measure(component: &Component, parallel: bool, pairs: &mut Pairs) {
+    let of_panel = |scratch: &mut Scratch, p: usize| {
+        let (mut quotients, residuals) = component.rayleigh(&pairs.vectors, p, scratch);
+        if component.has_null_vector && p == 0 {
             quotients[0] = 0.0;
         }
-        values.copy_from_slice(&quotients[..values.len()]);
-        pairs
-            .residuals
-            .extend_from_slice(&residuals[..values.len()]);
-    }
+        (quotients, residuals)
+    };
+    let panels = 0..pairs.vectors.n_panels();
+    let measured: Vec<_> = if parallel {
+        let panels = panels.into_par_iter();
+        panels.map_init(Scratch::default, of_panel).collect()
+    } else {
+        let mut scratch = Scratch::default();
+        panels.map(|p| of_panel(&mut scratch, p)).collect()
+    };
+    let k = pairs.values.len();
+    let (quotients, residuals): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
+    pairs.values = quotients.into_iter().flatten().take(k).collect();
+    pairs.residuals = residuals.into_iter().flatten().take(k).collect();
 }
 
-/// The pair whose residual is worst against `tolerance · max(λ, λ₊)`.
-fn worst_ratio(pairs: &Pairs, tolerance: f64) -> (usize, f64) {
+/// The residuals in units of what is allowed, `tolerance · max(λ, λ₊)`.
+fn ratios(pairs: &Pairs, tolerance: f64) -> Vec<f64> {
     let largest = pairs.values.last().copied().unwrap_or(0.0);
     let positive = pairs.values.iter().copied().find(|&l| l > 1e-12 * largest);
     // With zeros only, λ₊ is known to lie above the limit.
@@ -68,86 +90,94 @@ fn worst_ratio(pairs: &Pairs, tolerance: f64) -> (usize, f64) {
     } else {
         1.0
     });
-    let mut worst = (0, 0.0);
-    for (i, (&l, &r)) in pairs.values.iter().zip(&pairs.residuals).enumerate() {
-        let ratio = r / (tolerance * l.max(smallest));
-        // Not a number counts as worst.
-        if ratio.is_nan() || ratio > worst.1 {
-            worst = (i, ratio);
-        }
-    }
-    worst
+    let both = pairs.values.iter().zip(&pairs.residuals);
+    both.map(|(&l, &r)| r / (tolerance * l.max(smallest)))
+        .collect()
 }
 
-fn polish(component: &Component, parallel: bool, pairs: &mut Pairs) -> Result<(), SpectrumError> {
-    let (n, k) = (component.n(), pairs.values.len());
-    let largest = pairs.values[k - 1].abs().max(f64::MIN_POSITIVE);
-    let (factor, shift) = component.factor(-0.02 * largest)?;
-    if factor.n_negative > 0 {
+/// The index of the largest ratio; one that is not a number counts as larger.
+fn worst(ratios: &[f64]) -> usize {
+    let key = |i: &usize| ratios[*i];
+    (0..ratios.len())
+        .max_by(|a, b| key(a).total_cmp(&key(b)))
+        .unwrap_or(0)
+}
+
+/// Improves the pairs at `poor`, ascending, and keeps all vectors orthonormal.
+fn polish(
+    component: &Component,
+    parallel: bool,
+    pairs: &mut Pairs,
+    poor: &[usize],
+) -> Result<(), SpectrumError> {
+    let (n, k) = (component.n(), poor.len());
+    let largest = pairs.values[pairs.values.len() - 1];
+    let (factor, shift) = component.factor(-0.02 * largest.abs().max(f64::MIN_POSITIVE))?;
+    if factor.inertia.n_negative > 0 {
         return Err(SpectrumError::NotSemidefinite {
-            count: factor.n_negative,
+            count: factor.inertia.n_negative,
             below: shift,
         });
     }
-    let mut basis = Basis::new(n, pairs.panels.len(), parallel);
-    let mut images = Vec::with_capacity(pairs.panels.len());
-    for (p, panel) in pairs.panels.iter().enumerate() {
-        let mut y = panel.clone();
-        factor.solve(&mut y);
-        // Scaled to about unit length, so that the Gram matrix below is well conditioned.
-        let scale: [f64; WIDTH] =
-            std::array::from_fn(|c| pairs.values.get(p * WIDTH + c).map_or(0.0, |l| l - shift));
-        for row in &mut y {
-            for (x, s) in row.0.iter_mut().zip(&scale) {
+    let columns: Vec<_> = poor.iter().map(|&i| (0, i)).collect();
+    let x = Basis::of_columns(n, parallel, &[&pairs.vectors], &columns);
+    let n_panels = k.div_ceil(WIDTH);
+    let mut y = Basis::new(n, n_panels, parallel);
+    // Scaled to about unit length, so that the Gram matrix below is well conditioned.
+    let scales: Vec<f64> = poor.iter().map(|&i| pairs.values[i] - shift).collect();
+    for (p, scales) in scales.chunks(WIDTH).enumerate() {
+        let mut panel = x.panel(p);
+        factor.solve(&mut panel, parallel);
+        for row in &mut panel {
+            for (x, s) in row.0.iter_mut().zip(scales) {
                 *x *= s;
             }
         }
-        images.push((y, scale));
-    }
-    for (y, _) in &images {
-        basis.push(y);
+        if k < pairs.values.len() {
+            let [mut along] = pairs.vectors.project(0, [&panel]);
+            for &i in poor {
+                along[i / WIDTH][i % WIDTH] = Row::ZERO;
+            }
+            let away: Vec<Tile> = along.iter().map(negated).collect();
+            pairs.vectors.add_combination(0, [&away], [&mut panel]);
+        }
+        y.push(&panel);
     }
     // In the span of Y: (S - σ) Y = X D with D the scales, so YᵀSY - σ YᵀY = Yᵀ X D.
     let mut g = faer::Mat::<f64>::zeros(k, k);
     let mut h = faer::Mat::<f64>::zeros(k, k);
-    for (p, (y, scale)) in images.iter().enumerate() {
-        let of_y = basis.project(0, y);
-        let of_x = basis.project(0, &pairs.panels[p]);
+    for (p, scales) in scales.chunks(WIDTH).enumerate() {
+        let [of_y, of_x] = y.project(p, [&y.panel(p), &x.panel(p)]);
         for (b, (ty, tx)) in of_y.iter().zip(&of_x).enumerate() {
-            for i in 0..WIDTH {
-                for j in 0..WIDTH {
-                    let (row, column) = (b * WIDTH + i, p * WIDTH + j);
-                    if row < k && column < k {
-                        g[(row, column)] = ty[i].0[j];
-                        h[(row, column)] = tx[i].0[j] * scale[j];
-                    }
+            for i in 0..WIDTH.min(k - (p + b) * WIDTH) {
+                for (j, scale) in scales.iter().enumerate() {
+                    let (row, column) = ((p + b) * WIDTH + i, p * WIDTH + j);
+                    g[(row, column)] = ty[i].0[j];
+                    h[(row, column)] = tx[i].0[j] * scale;
+                    g[(column, row)] = g[(row, column)];
+                    h[(column, row)] = h[(row, column)];
                 }
             }
         }
     }
-    drop(images);
+    drop(x);
     let (values, z) = generalised_eigen(&h, &g)?;
-    let coefficients: Vec<Vec<Tile>> = (0..k.div_ceil(WIDTH))
-        .map(|p| {
-            (0..k.div_ceil(WIDTH))
-                .map(|b| {
-                    let mut tile = ZERO_TILE;
-                    for i in 0..WIDTH.min(k - b * WIDTH) {
-                        for j in 0..WIDTH.min(k - p * WIDTH) {
-                            tile[i].0[j] = z[(b * WIDTH + i, p * WIDTH + j)];
-                        }
-                    }
-                    tile
-                })
-                .collect()
-        })
+    let tile = |p: usize, b: usize| -> Tile {
+        let entry = |i: usize, j: usize| match (b * WIDTH + i, p * WIDTH + j) {
+            (row, column) if row < k && column < k => z[(row, column)],
+            _ => 0.0,
+        };
+        std::array::from_fn(|i| Row(std::array::from_fn(|j| entry(i, j))))
+    };
+    let coefficients: Vec<Vec<Tile>> = (0..n_panels)
+        .map(|p| (0..n_panels).map(|b| tile(p, b)).collect())
         .collect();
-    pairs.panels = basis.combinations(&coefficients);
-    pairs.values = values.iter().map(|mu| mu + shift).collect();
-    if component.has_null_vector {
-        pairs.values[0] = 0.0;
-        for (row, x) in pairs.panels[0].iter_mut().zip(component.null_vector()) {
-            row.0[0] = x;
+    y.transform(&coefficients);
+    for (from, &to) in poor.iter().enumerate() {
+        pairs.values[to] = values[from] + shift;
+        let rows = pairs.vectors.rows_of_mut(to / WIDTH).flatten();
+        for (row, x) in rows.zip(y.rows_of(from / WIDTH).flatten()) {
+            row.0[to % WIDTH] = x.0[from % WIDTH];
         }
     }
     Ok(())
