@@ -9,7 +9,7 @@ use crate::spectrum::{self, Spectrum, SpectrumError};
 use nalgebra::DMatrix;
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
-pub const ALGORITHM_VERSION: u32 = 1;
+pub const ALGORITHM_VERSION: u32 = 2;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
