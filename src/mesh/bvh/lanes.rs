@@ -12,8 +12,8 @@ pub(super) const FAN: usize = 32;
 /// Rays from one point, in single precision.
 #[derive(Debug, Clone)]
 pub(super) struct Fan {
-    /// Reciprocals of the directions, by axis.
-    inverse: [[f32; FAN]; 3],
+    /// Reciprocals of the directions.
+    pub(super) inverse: [[f32; 3]; FAN],
     /// How far each ray is followed, in its direction's units; negative where there is no ray.
     pub(super) limits: [f32; FAN],
 }
@@ -22,7 +22,7 @@ impl Fan {
     /// Of at most [`FAN`] directions.
     pub(super) fn new(directions: &[[f64; 3]]) -> Self {
         let mut fan = Self {
-            inverse: [[1.0; FAN]; 3],
+            inverse: [[1.0; 3]; FAN],
             limits: [-1.0; FAN],
         };
         for (i, direction) in directions.iter().enumerate() {
@@ -30,7 +30,7 @@ impl Fan {
             for axis in 0..3 {
                 // A ray along an axis: a reciprocal that is huge, but 0 times it is 0 and not NaN.
                 let x = direction[axis];
-                fan.inverse[axis][i] = if x.abs() < 1e-30 {
+                fan.inverse[i][axis] = if x.abs() < 1e-30 {
                     1e30
                 } else {
                     (1.0 / x) as f32
@@ -43,9 +43,12 @@ impl Fan {
 
 /// The tests; each gives numbers, and a bit for each lane in which they count.
 pub(super) trait Tests: Copy {
-    /// Which of the `active` rays of a fan enter a box within their limits; `planes` are the box's, as
-    /// seen from the origin of the rays.
-    fn enters(self, fan: &Fan, planes: [f32; 6], active: u32) -> u32;
+    /// The planes of a node as seen from a point.
+    fn planes_from(self, point: [f32; 3], node: &Wide) -> [[f32; WIDTH]; 6];
+
+    /// Which of eight boxes a ray enters before `limit`; `planes` are theirs, as seen from its origin, and
+    /// `inverse` the reciprocals of its direction.
+    fn enters(self, planes: &[[f32; WIDTH]; 6], inverse: [f32; 3], limit: f32) -> u32;
 
     /// Which rays of a fan are followed farther than `bound`.
     fn beyond(self, fan: &Fan, bound: f32) -> u32;
@@ -70,22 +73,26 @@ pub(super) trait Tests: Copy {
 pub(super) struct Portable;
 
 impl Tests for Portable {
-    fn enters(self, fan: &Fan, planes: [f32; 6], active: u32) -> u32 {
+    fn planes_from(self, point: [f32; 3], node: &Wide) -> [[f32; WIDTH]; 6] {
+        std::array::from_fn(|p| node.planes[p].map(|x| x - point[p / 2]))
+    }
+
+    fn enters(self, planes: &[[f32; WIDTH]; 6], inverse: [f32; 3], limit: f32) -> u32 {
         // Comparisons rather than `min` and `max`: nothing is NaN here.
         let lesser = |a: f32, b: f32| if a < b { a } else { b };
         let greater = |a: f32, b: f32| if a > b { a } else { b };
         let mut mask = 0;
-        for i in 0..FAN {
-            let (mut enter, mut leave) = (0.0, fan.limits[i]);
+        for i in 0..WIDTH {
+            let (mut enter, mut leave) = (0.0, limit);
             for axis in 0..3 {
-                let inverse = fan.inverse[axis][i];
-                let (a, b) = (planes[2 * axis] * inverse, planes[2 * axis + 1] * inverse);
+                let a = planes[2 * axis][i] * inverse[axis];
+                let b = planes[2 * axis + 1][i] * inverse[axis];
                 enter = greater(enter, lesser(a, b));
                 leave = lesser(leave, greater(a, b));
             }
             mask |= u32::from(enter <= leave) << i;
         }
-        mask & active
+        mask
     }
 
     fn beyond(self, fan: &Fan, bound: f32) -> u32 {
@@ -170,27 +177,29 @@ mod avx {
 
     impl Tests for V3 {
         #[inline(always)]
-        fn enters(self, fan: &Fan, planes: [f32; 6], active: u32) -> u32 {
+        fn planes_from(self, point: [f32; 3], node: &Wide) -> [[f32; WIDTH]; 6] {
             let avx = self.avx;
-            let mut mask = 0;
-            for group in (0..FAN).step_by(WIDTH) {
-                if active >> group & 0xff == 0 {
-                    continue;
-                }
-                let mut enter = avx._mm256_setzero_ps();
-                let mut leave = eight(&fan.limits, group);
-                for axis in 0..3 {
-                    let inverse = eight(&fan.inverse[axis], group);
-                    let (low, high) = (planes[2 * axis], planes[2 * axis + 1]);
-                    let a = avx._mm256_mul_ps(avx._mm256_set1_ps(low), inverse);
-                    let b = avx._mm256_mul_ps(avx._mm256_set1_ps(high), inverse);
-                    enter = avx._mm256_max_ps(enter, avx._mm256_min_ps(a, b));
-                    leave = avx._mm256_min_ps(leave, avx._mm256_max_ps(a, b));
-                }
-                let met = avx._mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave);
-                mask |= (avx._mm256_movemask_ps(met) as u32) << group;
+            let mut result = [[0.0; WIDTH]; 6];
+            for (p, plane) in result.iter_mut().enumerate() {
+                let from = avx._mm256_set1_ps(point[p / 2]);
+                *plane = cast(avx._mm256_sub_ps(cast(node.planes[p]), from));
             }
-            mask & active
+            result
+        }
+
+        #[inline(always)]
+        fn enters(self, planes: &[[f32; WIDTH]; 6], inverse: [f32; 3], limit: f32) -> u32 {
+            let avx = self.avx;
+            let (mut enter, mut leave) = (avx._mm256_setzero_ps(), avx._mm256_set1_ps(limit));
+            for axis in 0..3 {
+                let inverse = avx._mm256_set1_ps(inverse[axis]);
+                let a = avx._mm256_mul_ps(cast(planes[2 * axis]), inverse);
+                let b = avx._mm256_mul_ps(cast(planes[2 * axis + 1]), inverse);
+                enter = avx._mm256_max_ps(enter, avx._mm256_min_ps(a, b));
+                leave = avx._mm256_min_ps(leave, avx._mm256_max_ps(a, b));
+            }
+            let met = avx._mm256_cmp_ps::<_CMP_LE_OQ>(enter, leave);
+            avx._mm256_movemask_ps(met) as u32
         }
 
         #[inline(always)]
@@ -299,13 +308,12 @@ mod tests {
                 met[0] += mask.count_ones();
             }
             for node in &tree.nodes {
-                for child in 0..super::WIDTH {
-                    let planes = std::array::from_fn(|p| node.planes[p][child] - single[p / 2]);
-                    for active in [u32::MAX, 0xff00, 0x8001] {
-                        let mask = Portable.enters(&fan, planes, active);
-                        assert_eq!(mask, simd.enters(&fan, planes, active));
-                        met[1] += mask.count_ones();
-                    }
+                let planes = Portable.planes_from(single, node);
+                assert_eq!(planes, simd.planes_from(single, node));
+                for (inverse, limit) in fan.inverse.into_iter().zip(fan.limits) {
+                    let mask = Portable.enters(&planes, inverse, limit);
+                    assert_eq!(mask, simd.enters(&planes, inverse, limit));
+                    met[1] += mask.count_ones();
                 }
                 for limit in [f32::INFINITY, 0.2] {
                     let a = Portable.squares(single, [1e-6; 3], node, limit);

@@ -1,5 +1,5 @@
-//! The first face on each of many rays from one point: boxes against all rays, in single precision, then
-//! triangles in double.
+//! The first face on each of many rays from one point: eight boxes at a time, in single precision, then
+//! four triangles in double.
 //!
 //! Rays from one point meet mostly the same boxes at first. Followed together, they share the way through
 //! the tree, and with it the branches that no processor can foresee.
@@ -124,25 +124,35 @@ impl<T: Tests> NullaryFnOnce for Cast<'_, T> {
                     continue;
                 }
                 let node = &tree.nodes[entry.first as usize];
-                let (squares, mut children) = tests.squares(single, slack, node, f32::INFINITY);
+                // Few rays are together beyond the first nodes: each against all children at once.
+                let planes = tests.planes_from(single, node);
+                let mut going = [0_u32; WIDTH];
+                let mut children = 0;
+                while active != 0 {
+                    let ray = active.trailing_zeros() as usize % FAN;
+                    active &= active - 1;
+                    let mut met = tests.enters(&planes, fan.inverse[ray], fan.limits[ray]);
+                    met &= node.children;
+                    children |= met;
+                    while met != 0 {
+                        going[met.trailing_zeros() as usize % WIDTH] |= 1 << ray;
+                        met &= met - 1;
+                    }
+                }
+                if children == 0 {
+                    continue;
+                }
+                let (squares, _) = tests.squares(single, slack, node, f32::INFINITY);
                 let base = search.fans.len();
                 while children != 0 {
                     let child = children.trailing_zeros() as usize % WIDTH;
                     children &= children - 1;
-                    let mut planes = [0.0; 6];
-                    for (p, plane) in planes.iter_mut().enumerate() {
-                        *plane = node.planes[p][child] - single[p / 2];
-                    }
-                    let mask = tests.enters(&fan, planes, active);
-                    if mask == 0 {
-                        continue;
-                    }
                     let bound = squares[child].sqrt() * (1.0 - ROUNDING) - f32::MIN_POSITIVE;
                     search.fans.push(FanEntry {
                         first: node.first[child],
                         count: node.count[child],
                         bound,
-                        active: mask,
+                        active: going[child],
                     });
                     // Insertion: the nearest on top.
                     let mut at = search.fans.len() - 1;
