@@ -117,10 +117,8 @@ impl Cells {
                 sum: [0.0; 10],
             };
             for (p, m) in points[first..end].iter().zip(&moments[first..end]) {
-                for i in 0..3 {
-                    cell.low[i] = cell.low[i].min(p[i]);
-                    cell.high[i] = cell.high[i].max(p[i]);
-                }
+                cell.low = std::array::from_fn(|i| cell.low[i].min(p[i]));
+                cell.high = std::array::from_fn(|i| cell.high[i].max(p[i]));
                 add(&mut cell.sum, m);
             }
             cells.push(cell);

@@ -27,15 +27,14 @@ impl Fan {
         };
         for (i, direction) in directions.iter().enumerate() {
             fan.limits[i] = f32::INFINITY;
-            for axis in 0..3 {
-                // A ray along an axis: a reciprocal that is huge, but 0 times it is 0 and not NaN.
-                let x = direction[axis];
-                fan.inverse[i][axis] = if x.abs() < 1e-30 {
+            // A ray along an axis: a reciprocal that is huge, but 0 times it is 0 and not NaN.
+            fan.inverse[i] = direction.map(|x| {
+                if x.abs() < 1e-30 {
                     1e30
                 } else {
                     (1.0 / x) as f32
-                };
-            }
+                }
+            });
         }
         fan
     }
@@ -81,8 +80,7 @@ impl Tests for Portable {
         // Comparisons rather than `min` and `max`: nothing is NaN here.
         let lesser = |a: f32, b: f32| if a < b { a } else { b };
         let greater = |a: f32, b: f32| if a > b { a } else { b };
-        let mut mask = 0;
-        for i in 0..WIDTH {
+        let enters = |i: usize| {
             let (mut enter, mut leave) = (0.0, limit);
             for axis in 0..3 {
                 let a = planes[2 * axis][i] * inverse[axis];
@@ -90,9 +88,9 @@ impl Tests for Portable {
                 enter = greater(enter, lesser(a, b));
                 leave = lesser(leave, greater(a, b));
             }
-            mask |= u32::from(enter <= leave) << i;
-        }
-        mask
+            enter <= leave
+        };
+        (0..WIDTH).fold(0, |mask, i| mask | (u32::from(enters(i)) << i))
     }
 
     fn beyond(self, fan: &Fan, bound: f32) -> u32 {
