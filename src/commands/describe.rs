@@ -7,6 +7,7 @@ use clap::Args;
 use coseg::descriptors::{hks, hks_times};
 use coseg::library::report_to_json;
 use coseg::mesh::{self, CleanReport, Format, TriMesh};
+use coseg::operators::Laplacian;
 use coseg::pipeline::{DescribeError, N_HKS_TIMES, Params, describe, spectrum_of};
 use coseg::spectrum::Certificate;
 use coseg::store::write_description;
@@ -32,7 +33,8 @@ pub(crate) struct Describe {
     /// Which Laplacian
     #[arg(long, value_name = "OPERATOR", default_value = "tufted")]
     pub(crate) operator: crate::cli::Operator,
-    /// Only the spectrum and the heat kernel signature, at input resolution and in double precision
+    /// Only operator, spectrum and heat kernel signature, at input resolution and in double precision;
+    /// the file then also holds stiffness (CSR) and mass
     #[arg(long)]
     pub(crate) full: bool,
     /// Faces of the working resolution
@@ -41,40 +43,67 @@ pub(crate) struct Describe {
     /// Threads; the result does not depend on it
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub(crate) threads: u32,
-    /// Print the milliseconds of each stage
+    /// Print the milliseconds of each stage, with --full also of each part of the solver
     #[arg(long)]
     pub(crate) timings: bool,
 }
 
-/// Milliseconds by stage, in the order of the stages.
+/// Milliseconds by stage, in the order in which stages were first entered. What a stage `a.b` takes
+/// counts for `a` too; one that is entered again goes on counting.
 #[derive(Default)]
 struct Laps(RefCell<Running>);
 
-/// The laps so far, and since when the last one runs.
-type Running = (Vec<(String, f64)>, Option<Instant>);
+#[derive(Default)]
+struct Running {
+    laps: Vec<(String, f64)>,
+    /// The lap that runs, and the one within it, each with when it was entered.
+    open: Vec<(usize, Instant)>,
+}
 
 impl Laps {
-    /// Ends the stage before and begins this one.
+    /// Ends the stages that `name` is not within, and begins this one.
     fn enter(&self, name: &str) -> bool {
-        let (laps, since) = &mut *self.0.borrow_mut();
-        if laps.last().is_none_or(|last| last.0 != name) {
-            close(laps, since);
-            laps.push((name.to_owned(), 0.0));
-            *since = Some(Instant::now());
+        let running = &mut *self.0.borrow_mut();
+        let now = Instant::now();
+        let whole = name.split_once('.').map_or(name, |(whole, _)| whole);
+        let within = running
+            .open
+            .first()
+            .is_some_and(|(at, _)| running.laps[*at].0 == whole);
+        running.close(usize::from(within), now);
+        if !within {
+            running.begin(whole, now);
+        }
+        if name != whole {
+            running.begin(name, now);
         }
         true
     }
 
     fn finish(self) -> Vec<(String, f64)> {
-        let (mut laps, mut since) = self.0.into_inner();
-        close(&mut laps, &mut since);
-        laps
+        let mut running = self.0.into_inner();
+        running.close(0, Instant::now());
+        running.laps
     }
 }
 
-fn close(laps: &mut [(String, f64)], since: &mut Option<Instant>) {
-    if let (Some(last), Some(since)) = (laps.last_mut(), since.take()) {
-        last.1 = since.elapsed().as_secs_f64() * 1e3;
+impl Running {
+    /// Ends all open laps but the first `keep`.
+    fn close(&mut self, keep: usize, now: Instant) {
+        while self.open.len() > keep {
+            if let Some((at, since)) = self.open.pop() {
+                self.laps[at].1 += now.duration_since(since).as_secs_f64() * 1e3;
+            }
+        }
+    }
+
+    fn begin(&mut self, name: &str, now: Instant) {
+        let known = self.laps.iter().position(|lap| lap.0 == name);
+        let at = known.unwrap_or_else(|| {
+            self.laps.push((name.to_owned(), 0.0));
+            self.laps.len() - 1
+        });
+        self.open.push((at, now));
     }
 }
 
@@ -185,7 +214,7 @@ fn full(
         full_arrays(
             &cleaned.mesh,
             &cleaned.face_of_polygon,
-            &found.mass,
+            &found.operator,
             values,
             vectors.as_slice(),
             &hks,
@@ -214,12 +243,16 @@ fn full(
 fn full_arrays(
     mesh: &TriMesh,
     face_map: &[u32],
-    mass: &[f64],
+    operator: &Laplacian,
     eigenvalues: &[f64],
     eigenvectors: &[f64],
     hks: &[f64],
 ) -> Result<Vec<u8>, String> {
-    let (n, k) = (mass.len(), eigenvalues.len());
+    let (n, k) = (operator.mass.len(), eigenvalues.len());
+    let matrix = &operator.stiffness;
+    let indptr: Vec<u32> = matrix.proper_indptr().iter().map(|&i| i as u32).collect();
+    let indices: Vec<u32> = matrix.indices().iter().map(|&i| i as u32).collect();
+    let nnz = indices.len();
     let doubles = |x: &[f64]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let words = |x: &[u32]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let arrays = [
@@ -235,7 +268,15 @@ fn full_arrays(
             vec![mesh.faces.len(), 3],
             words(mesh.faces.as_flattened()),
         ),
-        ("mass", Dtype::F64, vec![n], doubles(mass)),
+        ("stiffness_indptr", Dtype::U32, vec![n + 1], words(&indptr)),
+        ("stiffness_indices", Dtype::U32, vec![nnz], words(&indices)),
+        (
+            "stiffness_data",
+            Dtype::F64,
+            vec![nnz],
+            doubles(matrix.data()),
+        ),
+        ("mass", Dtype::F64, vec![n], doubles(&operator.mass)),
         ("eigenvalues", Dtype::F64, vec![k], doubles(eigenvalues)),
         (
             "eigenvectors",
@@ -314,7 +355,7 @@ fn print(
     ))?;
     if args.timings {
         for (name, ms) in laps {
-            print_line(&format!("{name:>12} {ms:10.2} ms"))?;
+            print_line(&format!("{name:>20} {ms:10.2} ms"))?;
         }
     }
     Ok(())

@@ -2,7 +2,7 @@
 
 use crate::mesh::{FaceGeometry, dot};
 use nalgebra::Matrix3;
-use std::collections::BTreeMap;
+use pulp::{Arch, Simd, WithSimd};
 
 /// Radii of the neighbourhoods, for a mesh of area 1; ascending.
 const RADII: [f64; 3] = [0.05, 0.1, 0.2];
@@ -10,49 +10,37 @@ const RADII: [f64; 3] = [0.05, 0.1, 0.2];
 const WIDTH: usize = 5;
 /// Columns in all.
 pub(super) const N_COLUMNS: usize = WIDTH * RADII.len();
-/// Cells of the search grid, in largest radii: smaller ones visit fewer faces outside the ball.
-const CELL: f64 = 0.5;
+/// Edge of the cells that are within a ball, or without, as a whole: of about five faces of a proxy.
+const CELL: f64 = 0.05;
 /// Variances below this are rounding.
 const MIN_VARIANCE: f64 = 1e-12;
 
-/// Moments of area: its sum, of the coordinates and of their products.
-#[derive(Clone, Copy, Default)]
-struct Moments {
-    area: f64,
-    first: [f64; 3],
-    /// xx, yy, zz, xy, yz, zx.
-    second: [f64; 6],
+/// Moments of area about the origin: its sum, of the coordinates, and of their products xx, yy, zz, xy,
+/// yz, zx.
+type Moments = [f64; 10];
+
+fn moments(p: [f64; 3], area: f64) -> Moments {
+    let [x, y, z] = p.map(|x| x * area);
+    let [a, b, c] = p;
+    [area, x, y, z, x * a, y * b, z * c, x * b, y * c, z * a]
 }
 
-impl Moments {
-    fn add(&mut self, d: [f64; 3], area: f64) {
-        let w = [d[0] * area, d[1] * area, d[2] * area];
-        self.area += area;
-        for i in 0..3 {
-            self.first[i] += w[i];
-            self.second[i] += w[i] * d[i];
-            self.second[i + 3] += w[i] * d[(i + 1) % 3];
-        }
+#[inline(always)]
+fn add(sum: &mut Moments, other: &Moments) {
+    for (a, b) in sum.iter_mut().zip(other) {
+        *a += b;
     }
+}
 
-    fn join(&mut self, other: &Self) {
-        self.area += other.area;
-        for (a, b) in self.first.iter_mut().zip(&other.first) {
-            *a += b;
-        }
-        for (a, b) in self.second.iter_mut().zip(&other.second) {
-            *a += b;
-        }
-    }
-
-    fn covariance(&self) -> Matrix3<f64> {
-        let m = self.first.map(|x| x / self.area);
-        let c: [f64; 6] = std::array::from_fn(|i| {
-            let (a, b) = if i < 3 { (i, i) } else { (i - 3, (i - 2) % 3) };
-            self.second[i] / self.area - m[a] * m[b]
-        });
-        Matrix3::new(c[0], c[3], c[5], c[3], c[1], c[4], c[5], c[4], c[2])
-    }
+/// Of area about its centroid. Products of coordinates up to 1 leave 1e-16 of rounding, far below
+/// [`MIN_VARIANCE`].
+fn covariance(sum: &Moments) -> Matrix3<f64> {
+    let mean: [f64; 3] = std::array::from_fn(|i| sum[1 + i] / sum[0]);
+    let c: [f64; 6] = std::array::from_fn(|i| {
+        let (a, b) = if i < 3 { (i, i) } else { (i - 3, (i - 2) % 3) };
+        sum[4 + i] / sum[0] - mean[a] * mean[b]
+    });
+    Matrix3::new(c[0], c[3], c[5], c[3], c[1], c[4], c[5], c[4], c[2])
 }
 
 /// Eigenvalues of a symmetric matrix in descending order, at least 1e-12, and unit eigenvectors.
@@ -70,67 +58,172 @@ pub(super) fn principal(matrix: Matrix3<f64>) -> ([f64; 3], [[f64; 3]; 3]) {
 /// `(e₂ − e₃)/e₁` (planar), `e₃/e₁` (scattered), area over that of the disc, and |normal · axis of e₁|.
 /// O(m × faces in a ball).
 pub fn local_pca(geometry: &FaceGeometry) -> Vec<f64> {
-    let largest = RADII[RADII.len() - 1];
-    let cell = |p: [f64; 3]| p.map(|x| (x / (CELL * largest)).floor() as i64);
-    let reach = (1.0 / CELL).ceil() as i64;
-    let mut grid: BTreeMap<[i64; 3], Vec<u32>> = BTreeMap::new();
-    for (f, &c) in geometry.centroids.iter().enumerate() {
-        grid.entry(cell(c)).or_default().push(f as u32);
-    }
     let mut result = vec![0.0; geometry.areas.len() * N_COLUMNS];
-    let mut near: Vec<([f64; 3], f64)> = Vec::new();
-    for (&[x, y, z], faces) in &grid {
-        near.clear();
-        for i in x - reach..=x + reach {
-            for j in y - reach..=y + reach {
-                for (_, others) in grid.range([i, j, z - reach]..=[i, j, z + reach]) {
-                    near.extend(
-                        others
-                            .iter()
-                            .map(|&g| (geometry.centroids[g as usize], geometry.areas[g as usize])),
-                    );
-                }
-            }
-        }
-        for &f in faces {
-            let row = &mut result[f as usize * N_COLUMNS..(f as usize + 1) * N_COLUMNS];
-            describe(geometry, f as usize, &near, row);
-        }
-    }
+    let cells = Cells::new(geometry);
+    Arch::new().dispatch(Balls {
+        geometry,
+        cells: &cells,
+        result: &mut result,
+    });
     result
 }
 
-fn describe(geometry: &FaceGeometry, f: usize, near: &[([f64; 3], f64)], row: &mut [f64]) {
-    let center = geometry.centroids[f];
-    let mut shells = [Moments::default(); RADII.len()];
-    let squares = RADII.map(|r| r * r);
-    for &(p, area) in near {
-        let d = [p[0] - center[0], p[1] - center[1], p[2] - center[2]];
-        let square = dot(d, d);
-        if square <= squares[2] {
-            // Adding up comparisons is quicker than branching on them.
-            let shell = usize::from(square > squares[0]) + usize::from(square > squares[1]);
-            shells[shell].add(d, area);
+/// Faces sorted into the cells of a grid that their centroids are in.
+struct Cells {
+    cells: Vec<Cell>,
+    /// The faces of the first cell, then of the second, …; `points` and `moments` alike.
+    faces: Vec<u32>,
+    points: Vec<[f64; 3]>,
+    moments: Vec<Moments>,
+}
+
+struct Cell {
+    /// Along the first axis, by which cells ascend.
+    index: i64,
+    first: usize,
+    end: usize,
+    /// The box of its centroids.
+    low: [f64; 3],
+    high: [f64; 3],
+    sum: Moments,
+}
+
+impl Cells {
+    fn new(geometry: &FaceGeometry) -> Self {
+        let mut order: Vec<([i64; 3], u32)> = (0_u32..)
+            .zip(&geometry.centroids)
+            .map(|(f, c)| (c.map(|x| (x / CELL).floor() as i64), f))
+            .collect();
+        order.sort_unstable();
+        let faces: Vec<u32> = order.iter().map(|o| o.1).collect();
+        let points: Vec<[f64; 3]> = faces
+            .iter()
+            .map(|&f| geometry.centroids[f as usize])
+            .collect();
+        let moments: Vec<Moments> = faces
+            .iter()
+            .map(|&f| moments(geometry.centroids[f as usize], geometry.areas[f as usize]))
+            .collect();
+        let mut cells = Vec::new();
+        let mut first = 0;
+        for chunk in order.chunk_by(|a, b| a.0 == b.0) {
+            let end = first + chunk.len();
+            let mut cell = Cell {
+                index: chunk[0].0[0],
+                first,
+                end,
+                low: points[first],
+                high: points[first],
+                sum: [0.0; 10],
+            };
+            for (p, m) in points[first..end].iter().zip(&moments[first..end]) {
+                cell.low = std::array::from_fn(|i| cell.low[i].min(p[i]));
+                cell.high = std::array::from_fn(|i| cell.high[i].max(p[i]));
+                add(&mut cell.sum, m);
+            }
+            cells.push(cell);
+            first = end;
+        }
+        Self {
+            cells,
+            faces,
+            points,
+            moments,
         }
     }
-    let mut ball = Moments::default();
-    for ((shell, radius), columns) in shells.iter().zip(RADII).zip(row.chunks_exact_mut(WIDTH)) {
-        ball.join(shell);
-        let (e, axes) = principal(ball.covariance());
-        // A face alone in its ball has no axis.
-        let axis = if e[0] > MIN_VARIANCE {
-            axes[0]
-        } else {
-            [0.0; 3]
-        };
-        columns.copy_from_slice(&[
-            (e[0] - e[1]) / e[0],
-            (e[1] - e[2]) / e[0],
-            e[2] / e[0],
-            ball.area / (std::f64::consts::PI * radius * radius),
-            dot(geometry.normals[f], axis).abs(),
-        ]);
+}
+
+struct Balls<'a> {
+    geometry: &'a FaceGeometry,
+    cells: &'a Cells,
+    result: &'a mut [f64],
+}
+
+impl WithSimd for Balls<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self {
+            geometry,
+            cells,
+            result,
+        } = self;
+        let reach = (RADII[RADII.len() - 1] / CELL).ceil() as i64;
+        for home in &cells.cells {
+            // Cells that are in the balls about all faces of this one, and those that may be in part.
+            let mut inside = [[0.0; 10]; RADII.len()];
+            let mut crossed: [Vec<(usize, usize)>; RADII.len()] = Default::default();
+            let from = cells
+                .cells
+                .partition_point(|c| c.index < home.index - reach);
+            let to = cells
+                .cells
+                .partition_point(|c| c.index <= home.index + reach);
+            for cell in &cells.cells[from..to] {
+                let (least, most) = distances(home, cell);
+                for (i, radius) in RADII.iter().enumerate() {
+                    if most <= radius * radius {
+                        add(&mut inside[i], &cell.sum);
+                    } else if least <= radius * radius {
+                        crossed[i].push((cell.first, cell.end));
+                    }
+                }
+            }
+            for at in home.first..home.end {
+                let center = cells.points[at];
+                let f = cells.faces[at] as usize;
+                let row = &mut result[f * N_COLUMNS..(f + 1) * N_COLUMNS];
+                for (i, columns) in row.chunks_exact_mut(WIDTH).enumerate() {
+                    let square = RADII[i] * RADII[i];
+                    let mut ball = inside[i];
+                    for &(first, end) in &crossed[i] {
+                        let members = cells.points[first..end].iter();
+                        for (p, moments) in members.zip(&cells.moments[first..end]) {
+                            let d = [p[0] - center[0], p[1] - center[1], p[2] - center[2]];
+                            // Multiplying is quicker than branching on what cannot be foreseen.
+                            let within = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= square;
+                            let weight = f64::from(u8::from(within));
+                            for (a, b) in ball.iter_mut().zip(moments) {
+                                *a += weight * b;
+                            }
+                        }
+                    }
+                    describe(&ball, RADII[i], geometry.normals[f], columns);
+                }
+            }
+        }
     }
+}
+
+/// Squares of the least and of the largest distance between points of the boxes of two cells.
+#[inline(always)]
+fn distances(a: &Cell, b: &Cell) -> (f64, f64) {
+    let (mut least, mut most) = (0.0, 0.0);
+    for i in 0..3 {
+        let (up, down) = (b.high[i] - a.low[i], a.high[i] - b.low[i]);
+        let (gap, span) = ((-up).max(-down).max(0.0), up.max(down));
+        least += gap * gap;
+        most += span * span;
+    }
+    (least, most)
+}
+
+fn describe(ball: &Moments, radius: f64, normal: [f64; 3], columns: &mut [f64]) {
+    let (e, axes) = principal(covariance(ball));
+    // A face alone in its ball has no axis.
+    let axis = if e[0] > MIN_VARIANCE {
+        axes[0]
+    } else {
+        [0.0; 3]
+    };
+    columns.copy_from_slice(&[
+        (e[0] - e[1]) / e[0],
+        (e[1] - e[2]) / e[0],
+        e[2] / e[0],
+        ball[0] / (std::f64::consts::PI * radius * radius),
+        dot(normal, axis).abs(),
+    ]);
 }
 
 #[cfg(test)]

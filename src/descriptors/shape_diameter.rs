@@ -4,7 +4,7 @@
 //! diameter function*.
 
 use super::quantile;
-use crate::mesh::{Bvh, FaceGeometry, TriMesh, add, cross, dot, scale, sub, unit};
+use crate::mesh::{Bvh, FaceGeometry, Search, TriMesh, add, cross, dot, scale, sub, unit};
 
 /// Rays for each face.
 const N_RAYS: usize = 30;
@@ -27,7 +27,8 @@ const DEPTH: f64 = 1e-4;
 pub fn shape_diameter(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<f64> {
     let tree = Bvh::new(mesh);
     let rays = cone();
-    let mut lengths = Vec::with_capacity(N_RAYS);
+    let mut search = Search::default();
+    let (mut found, mut lengths) = (Vec::new(), Vec::with_capacity(N_RAYS));
     let mut diameters: Vec<Option<f64>> = Vec::with_capacity(mesh.faces.len());
     for f in 0..mesh.faces.len() {
         let inward = scale(geometry.normals[f], -1.0);
@@ -35,13 +36,14 @@ pub fn shape_diameter(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<f64> {
         let x = unit(longest_edge(mesh.corners(f)));
         let y = cross(inward, x);
         let origin = add(geometry.centroids[f], scale(inward, DEPTH));
+        let directions: [[f64; 3]; N_RAYS] = std::array::from_fn(|i| {
+            let [a, b, c] = rays[i].0;
+            add(add(scale(x, a), scale(y, b)), scale(inward, c))
+        });
+        tree.cast(&mut search, origin, &directions, f as u32, &mut found);
+        let met = found.iter().zip(&rays).filter(|(x, _)| x.is_finite());
         lengths.clear();
-        for ([a, b, c], weight) in &rays {
-            let direction = add(add(scale(x, *a), scale(y, *b)), scale(inward, *c));
-            if let Some(length) = tree.cast(origin, direction, f as u32) {
-                lengths.push((length, *weight));
-            }
-        }
+        lengths.extend(met.map(|(length, (_, weight))| (*length, *weight)));
         diameters.push(robust_mean(&mut lengths));
     }
     let mut found: Vec<f64> = diameters.iter().flatten().copied().collect();
@@ -58,22 +60,23 @@ fn longest_edge([a, b, c]: [[f64; 3]; 3]) -> [f64; 3] {
         .fold([0.0; 3], |x, y| if dot(y, y) > dot(x, x) { y } else { x })
 }
 
-/// Directions about the z axis, and their weights.
-fn cone() -> Vec<([f64; 3], f64)> {
+/// Unit directions about the z axis, and their weights.
+fn cone() -> [([f64; 3], f64); N_RAYS] {
     let opening = 1.0 - HALF_ANGLE.to_radians().cos();
-    (0..N_RAYS)
-        .map(|i| {
-            let share = (i as f64 + 0.5) / N_RAYS as f64;
-            let angle = (1.0 - share * opening).acos();
-            let turn = TURN * i as f64;
-            let direction = [
-                angle.sin() * turn.cos(),
-                angle.sin() * turn.sin(),
-                angle.cos(),
-            ];
-            (direction, 1.0 / (angle + ANGLE_OFFSET))
-        })
-        .collect()
+    let mut rays: [_; N_RAYS] = std::array::from_fn(|i| {
+        let share = (i as f64 + 0.5) / N_RAYS as f64;
+        let angle = (1.0 - share * opening).acos();
+        let turn = TURN * i as f64;
+        let direction = [
+            angle.sin() * turn.cos(),
+            angle.sin() * turn.sin(),
+            angle.cos(),
+        ];
+        (direction, 1.0 / (angle + ANGLE_OFFSET))
+    });
+    // Around the axis: neighbours meet mostly the same boxes.
+    rays.sort_by(|(a, _), (b, _)| a[1].atan2(a[0]).total_cmp(&b[1].atan2(b[0])));
+    rays
 }
 
 /// Weighted mean of the lengths near the median; `None` of none.

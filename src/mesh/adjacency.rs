@@ -14,26 +14,51 @@ pub(crate) struct EdgeFaces {
 }
 
 impl EdgeFaces {
-    /// Edges of a face list; the two ends of an edge differ. O(m log m).
+    /// Edges of a face list; the two ends of an edge differ. O(m), where no vertex has many edges.
     pub(crate) fn new(faces: &[[u32; 3]]) -> Self {
-        let mut sides: Vec<([u32; 2], u32, u8)> = Vec::with_capacity(3 * faces.len());
-        for (f, face) in faces.iter().enumerate() {
-            for corner in 0..3_u8 {
-                let a = face[(corner as usize + 1) % 3];
-                let b = face[(corner as usize + 2) % 3];
-                sides.push(([a.min(b), a.max(b)], f as u32, corner));
+        let n = faces.iter().flatten().max().map_or(0, |&v| v as usize + 1);
+        let sides = |face: &[u32; 3]| {
+            let [a, b, c] = *face;
+            [(b, c), (c, a), (a, b)].map(|(a, b)| [a.min(b), a.max(b)])
+        };
+        // Sorted by the smaller vertex by counting, then by the larger.
+        let mut starts = vec![0_u32; n + 1];
+        for [a, _] in faces.iter().flat_map(sides) {
+            starts[a as usize + 1] += 1;
+        }
+        for i in 1..starts.len() {
+            starts[i] += starts[i - 1];
+        }
+        // The larger vertex, and face and corner in one word: both in the order of what they stand for.
+        let mut sorted = vec![(0_u32, 0_u64); 3 * faces.len()];
+        let mut next = starts.clone();
+        for (f, face) in (0_u64..).zip(faces) {
+            for (corner, [a, b]) in (0_u64..).zip(sides(face)) {
+                let slot = &mut next[a as usize];
+                sorted[*slot as usize] = (b, f << 2 | corner);
+                *slot += 1;
             }
         }
-        sides.sort_unstable();
-        let mut result = Self::default();
-        for (i, &(edge, face, corner)) in sides.iter().enumerate() {
-            if result.edges.last() != Some(&edge) {
-                result.edges.push(edge);
-                result.offsets.push(i);
+        let mut result = Self {
+            edges: Vec::with_capacity(sorted.len() / 2),
+            offsets: Vec::with_capacity(sorted.len() / 2 + 1),
+            incidences: Vec::with_capacity(sorted.len()),
+        };
+        for (a, range) in (0_u32..).zip(starts.windows(2)) {
+            let around = &mut sorted[range[0] as usize..range[1] as usize];
+            around.sort_unstable();
+            let mut before = None;
+            for &mut (b, incidence) in around {
+                if before != Some(b) {
+                    result.edges.push([a, b]);
+                    result.offsets.push(result.incidences.len());
+                    before = Some(b);
+                }
+                let corner = (incidence & 3) as u8;
+                result.incidences.push(((incidence >> 2) as u32, corner));
             }
-            result.incidences.push((face, corner));
         }
-        result.offsets.push(sides.len());
+        result.offsets.push(sorted.len());
         result
     }
 

@@ -20,7 +20,7 @@ pub(crate) mod zoo;
 
 pub use adjacency::{DualEdge, DualGraph, FaceGeometry};
 pub use bridges::bridges;
-pub use bvh::Bvh;
+pub use bvh::{Bvh, Search};
 pub use clean::{CleanError, Cleaned, clean};
 pub use geodesic::EdgeGraph;
 pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, parse};

@@ -5,11 +5,10 @@
 //! are rounded to single precision, in which they are stored, so that what is computed from a fresh
 //! proxy and from a stored one is the same.
 
-use super::clean::{is_degenerate, normalize};
+use super::clean::{corner_word, is_degenerate, normalize};
 use super::refine::refine;
-use super::{Bvh, FaceGeometry, TriMesh, dot, scale, sub};
+use super::{Bvh, FaceGeometry, Search, TriMesh, dot, scale, sub};
 use meshopt::{SimplifyOptions, VertexDataAdapter};
-use std::collections::BTreeSet;
 
 /// A mesh is simplified when it has more faces than this times what was asked for.
 const EXCESS: f64 = 1.15;
@@ -133,26 +132,37 @@ fn simplify(mesh: &TriMesh, target: usize) -> Vec<[u32; 3]> {
 /// The faces between distinct positions, without those that coincide or collapse: simplification takes
 /// vertices at one position for a seam and will not move them.
 fn weld(positions: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[u32; 3]> {
-    let mut order: Vec<([u32; 3], u32)> = (0_u32..)
+    // As in cleaning, words that hold all that is sorted by.
+    let mut order: Vec<u128> = (0_u32..)
         .zip(positions)
-        .map(|(v, p)| (p.map(|x| (x + 0.0).to_bits()), v))
+        .map(|(v, p)| {
+            let bits = p.map(|x| (x + 0.0).to_bits()).into_iter().chain([v]);
+            bits.fold(0, |word, x| word << 32 | u128::from(x))
+        })
         .collect();
     order.sort_unstable();
     let mut first: Vec<u32> = (0..positions.len() as u32).collect();
-    for i in 1..order.len() {
-        if order[i].0 == order[i - 1].0 {
-            first[order[i].1 as usize] = first[order[i - 1].1 as usize];
+    for same in order.chunk_by(|a, b| a >> 32 == b >> 32) {
+        for &word in same {
+            first[word as u32 as usize] = same[0] as u32;
         }
     }
-    let mut seen = BTreeSet::new();
-    let renamed = faces.iter().map(|f| f.map(|v| first[v as usize]));
-    renamed
-        .filter(|&[a, b, c]| {
-            let mut corners = [a, b, c];
-            corners.sort_unstable();
-            a != b && b != c && c != a && seen.insert(corners)
-        })
-        .collect()
+    let renamed: Vec<[u32; 3]> = faces
+        .iter()
+        .map(|f| f.map(|v| first[v as usize]))
+        .filter(|&[a, b, c]| a != b && b != c && c != a)
+        .collect();
+    let mut words: Vec<u128> = (0_u128..)
+        .zip(&renamed)
+        .map(|(f, &corners)| corner_word(corners) << 32 | f)
+        .collect();
+    words.sort_unstable();
+    let mut kept: Vec<u32> = words
+        .chunk_by(|a, b| a >> 32 == b >> 32)
+        .map(|same| same[0] as u32)
+        .collect();
+    kept.sort_unstable();
+    kept.iter().map(|&f| renamed[f as usize]).collect()
 }
 
 /// Drops vertices that no face uses.
@@ -198,6 +208,7 @@ fn face_map(cleaned: &TriMesh, center: [f64; 3], factor: f64, proxy: &TriMesh) -
     // Edge of equilateral triangles of the mean area.
     let mean_edge = (4.0 / 3.0_f64.sqrt() / proxy.faces.len() as f64).sqrt();
     let mut hint = 0_u32;
+    let mut search = Search::default();
     let mut result = Vec::with_capacity(cleaned.faces.len());
     for (centroid, normal) in from.centroids.iter().zip(&from.normals) {
         let point = scale(sub(*centroid, center), factor);
@@ -208,7 +219,7 @@ fn face_map(cleaned: &TriMesh, center: [f64; 3], factor: f64, proxy: &TriMesh) -
         let bound = tree.distance_to(hint, point) + extra(hint);
         let limit = bound * (1.0 + 1e-9) + f64::MIN_POSITIVE;
         hint = tree
-            .nearest(point, limit, extra)
+            .nearest(&mut search, point, limit, extra)
             .map_or(hint, |(face, _)| face);
         result.push(hint);
     }

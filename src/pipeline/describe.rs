@@ -3,13 +3,13 @@
 use super::{Description, Params};
 use crate::descriptors;
 use crate::mesh::{self, CleanError, DualGraph, Format, ParseError, TriMesh};
-use crate::operators::{LaplacianError, laplacian};
+use crate::operators::{Laplacian, LaplacianError, laplacian};
 use crate::segmentation::patches;
 use crate::spectrum::{self, Spectrum, SpectrumError};
 use nalgebra::DMatrix;
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
-pub const ALGORITHM_VERSION: u32 = 1;
+pub const ALGORITHM_VERSION: u32 = 2;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
@@ -40,8 +40,8 @@ pub enum DescribeError {
 pub struct MeshSpectrum {
     /// Eigenpairs, scaled to area 1.
     pub spectrum: Spectrum,
-    /// Lumped mass `(n,)`, sums to 1.
-    pub mass: Vec<f64>,
+    /// What it is the spectrum of.
+    pub operator: Laplacian,
 }
 
 /// Describes a mesh. `stage` is told the name of each stage as it begins; when it returns false the work stops
@@ -80,7 +80,8 @@ pub fn describe(
         faces: proxy.mesh.faces,
     };
     let bridges = mesh::bridges(&proxy_mesh);
-    let found = spectrum_of(&proxy_mesh, &bridges, params, stage)?;
+    let whole = |name: &str| stage(name.split_once('.').map_or(name, |(whole, _)| whole));
+    let found = spectrum_of(&proxy_mesh, &bridges, params, &whole)?;
     enter("descriptors")?;
     let dual = DualGraph::new(&proxy_mesh, &bridges);
     let (values, vectors) = (&found.spectrum.eigenvalues, &found.spectrum.eigenvectors);
@@ -105,7 +106,7 @@ pub fn describe(
         area: cleaned.area,
         report,
         faces: proxy_mesh.faces,
-        mass: found.mass.iter().map(|m| *m as f32).collect(),
+        mass: found.operator.mass.iter().map(|m| *m as f32).collect(),
         eigenvalues: values.clone(),
         eigenvectors: row_major(vectors, n_eigenvectors),
         n_eigenvectors,
@@ -120,7 +121,8 @@ pub fn describe(
     })
 }
 
-/// The spectrum of a mesh of area 1, with the stages `laplacian` and `spectrum`.
+/// The spectrum of a mesh of area 1, with the stages `laplacian` and `spectrum`, and within the latter
+/// those of the solver: `spectrum.factor`, `spectrum.iterate` and so on, over and over.
 ///
 /// # Errors
 /// As [`laplacian`] and [`Spectrum::smallest`].
@@ -137,10 +139,9 @@ pub fn spectrum_of(
     if !stage("spectrum") {
         return Err(DescribeError::Cancelled("spectrum"));
     }
-    // The solver's own stages only ask whether to go on.
-    let go_on = |_: &str| stage("spectrum");
+    let part = |name: &str| stage(&format!("spectrum.{name}"));
     let options = spectrum::Options {
-        stage: Some(&go_on),
+        stage: Some(&part),
         threads: params.threads as usize,
         ..spectrum::Options::default()
     };
@@ -150,10 +151,7 @@ pub fn spectrum_of(
         k = k.min(n / 4).max(MIN_EIGENPAIRS.min(n));
     }
     let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)?;
-    Ok(MeshSpectrum {
-        spectrum,
-        mass: operator.mass,
-    })
+    Ok(MeshSpectrum { spectrum, operator })
 }
 
 /// The first `n` columns, row-major, in single precision.

@@ -6,5 +6,6 @@ mod cli;
 mod daemon;
 mod harness;
 mod pipeline;
+mod spectra;
 mod store;
 mod tidy;

@@ -1,200 +1,213 @@
-//! The first face on a ray: four boxes at a time, in single precision, then triangles in double.
+//! The first face on each of many rays from one point: eight boxes at a time, in single precision, then
+//! four triangles in double.
+//!
+//! Rays from one point meet mostly the same boxes at first. Followed together, they share the way through
+//! the tree, and with it the branches that no processor can foresee.
 
-use super::{Bvh, Node, STACK};
-use crate::mesh::{cross, dot, sub};
-
-/// Four boxes side by side, tested against a ray together: the binary tree with every second level
-/// left out.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Quad {
-    /// By axis and child; padded, so that rounding to single precision cannot lose a hit.
-    low: [[f32; 4]; 3],
-    high: [[f32; 4]; 3],
-    /// Leaf: first face in `order`. Inner: its quad.
-    first: [u32; 4],
-    /// Faces of a leaf; 0 for an inner child; `NO_CHILD` for none.
-    count: [u32; 4],
-}
-
-const NO_CHILD: u32 = u32::MAX;
-/// Padding of single-precision boxes, relative to the largest coordinate.
-const PADDING: f64 = 1e-6;
+use super::ROUNDING;
+use super::lanes::{FAN, Fan, Portable, Tests};
+use super::wide::{LANES, WIDTH};
+use super::{Bvh, Search};
+use pulp::NullaryFnOnce;
 
 impl Bvh {
-    /// Distance along `direction` (in its units) to the first face the ray from `origin` meets, from
-    /// either side, other than face `except`; `None` when it meets none.
-    pub fn cast(&self, origin: [f64; 3], direction: [f64; 3], except: u32) -> Option<f64> {
-        if self.order.is_empty() {
-            return None;
+    /// For each of several rays from `origin` the distance along its direction to the first face it
+    /// meets, from either side, other than face `except`; infinite when it meets none. Directions have
+    /// length 1, or less: then distances are in units of it. Rays are quickest in the order of their
+    /// directions.
+    pub fn cast(
+        &self,
+        search: &mut Search,
+        origin: [f64; 3],
+        directions: &[[f64; 3]],
+        except: u32,
+        lengths: &mut Vec<f64>,
+    ) {
+        lengths.clear();
+        let rays = Rays {
+            tree: self,
+            origin,
+            directions,
+            except,
+        };
+        #[cfg(target_arch = "x86_64")]
+        if let Some(simd) = super::lanes::V3::try_new() {
+            return simd.vectorize(Cast {
+                rays,
+                search,
+                lengths,
+                tests: simd,
+            });
         }
-        let o = origin.map(|x| x as f32);
-        // A ray along an axis: a reciprocal that is huge, but 0 times it is 0 and not NaN.
-        let inverse = direction.map(|x| {
-            if x.abs() < 1e-30 {
-                1e30
-            } else {
-                (1.0 / x) as f32
-            }
-        });
-        let mut best = f64::INFINITY;
-        // Each quad is two levels and leaves at most three entries behind.
-        let mut stack = [(0_u32, 0_u32, 0.0_f32); 2 * STACK];
-        let mut depth = 1;
-        while depth > 0 {
-            depth -= 1;
-            let (first, count, entry) = stack[depth];
-            if f64::from(entry) >= best {
-                continue;
-            }
-            if count > 0 {
-                for i in first as usize..(first + count) as usize {
-                    if self.order[i] != except {
-                        let t = hit(&self.triangles[i], origin, direction);
-                        best = if t < best { t } else { best };
-                    }
-                }
-                continue;
-            }
-            let quad = &self.quads[first as usize];
-            let enter = quad_entries(quad, o, inverse, best as f32);
-            let base = depth;
-            for (child, &entry) in enter.iter().enumerate() {
-                if quad.count[child] == NO_CHILD || entry.is_infinite() {
+        Cast {
+            rays,
+            search,
+            lengths,
+            tests: Portable,
+        }
+        .call();
+    }
+}
+
+struct Rays<'a> {
+    tree: &'a Bvh,
+    origin: [f64; 3],
+    directions: &'a [[f64; 3]],
+    except: u32,
+}
+
+struct Cast<'a, T> {
+    rays: Rays<'a>,
+    search: &'a mut Search,
+    lengths: &'a mut Vec<f64>,
+    tests: T,
+}
+
+/// What is still to be visited by some rays.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct FanEntry {
+    /// A node, or the first block of a leaf.
+    first: u32,
+    /// Blocks of a leaf; 0 for a node.
+    count: u32,
+    /// No point of it is nearer to the origin.
+    bound: f32,
+    active: u32,
+}
+
+impl<T: Tests> NullaryFnOnce for Cast<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let (search, tests) = (self.search, self.tests);
+        let Rays {
+            tree,
+            origin,
+            directions,
+            except,
+        } = self.rays;
+        let single = origin.map(|x| x as f32);
+        let slack = single.map(|x| ROUNDING * x.abs());
+        for directions in directions.chunks(FAN) {
+            let mut fan = Fan::new(directions);
+            let mut best = [f64::INFINITY; FAN];
+            search.fans.clear();
+            search.fans.push(FanEntry {
+                first: 0,
+                count: 0,
+                bound: -1.0,
+                active: u32::MAX,
+            });
+            while let Some(entry) = search.fans.pop() {
+                let mut active = entry.active & tests.beyond(&fan, entry.bound);
+                if active == 0 {
                     continue;
                 }
-                // Insertion: the nearest on top.
-                let mut at = depth;
-                while at > base && stack[at - 1].2 < entry {
-                    stack[at] = stack[at - 1];
-                    at -= 1;
+                if entry.count > 0 {
+                    let blocks = entry.first as usize..(entry.first + entry.count) as usize;
+                    while active != 0 {
+                        let ray = active.trailing_zeros() as usize;
+                        active &= active - 1;
+                        for block in &tree.blocks[blocks.clone()] {
+                            let (lengths, mut met) = tests.hits(origin, directions[ray], block);
+                            while met != 0 {
+                                let lane = met.trailing_zeros() as usize % LANES;
+                                met &= met - 1;
+                                if lengths[lane] < best[ray] && block.faces[lane] != except {
+                                    best[ray] = lengths[lane];
+                                    fan.limits[ray] = lengths[lane] as f32;
+                                }
+                            }
+                        }
+                    }
+                    continue;
                 }
-                stack[at] = (quad.first[child], quad.count[child], entry);
-                depth += 1;
-            }
-        }
-        best.is_finite().then_some(best)
-    }
-}
-
-/// The binary tree, two levels at a time; quad 0 is the root.
-pub(super) fn quads(nodes: &[Node]) -> Vec<Quad> {
-    let corners = [&nodes[0].low, &nodes[0].high];
-    let largest = corners
-        .into_iter()
-        .flatten()
-        .fold(0.0, |m: f64, x| m.max(x.abs()));
-    let padding = PADDING * largest;
-    let empty = Quad {
-        low: [[0.0; 4]; 3],
-        high: [[0.0; 4]; 3],
-        first: [0; 4],
-        count: [NO_CHILD; 4],
-    };
-    let mut result = vec![empty];
-    if nodes.len() == 1 && nodes[0].count == 0 {
-        return result;
-    }
-    let mut todo = vec![(0_usize, 0_usize)];
-    while let Some((node, at)) = todo.pop() {
-        let children = |n: usize| [nodes[n].first as usize, nodes[n].first as usize + 1];
-        let leaf = |n: usize| nodes[n].count > 0;
-        let mut members = Vec::with_capacity(4);
-        if leaf(node) {
-            members.push(node);
-        } else {
-            for child in children(node) {
-                if leaf(child) {
-                    members.push(child)
-                } else {
-                    members.extend(children(child))
+                let node = &tree.nodes[entry.first as usize];
+                // Few rays are together beyond the first nodes: each against all children at once.
+                let planes = tests.planes_from(single, node);
+                let mut going = [0_u32; WIDTH];
+                let mut children = 0;
+                while active != 0 {
+                    let ray = active.trailing_zeros() as usize % FAN;
+                    active &= active - 1;
+                    let mut met = tests.enters(&planes, fan.inverse[ray], fan.limits[ray]);
+                    met &= node.children;
+                    children |= met;
+                    while met != 0 {
+                        going[met.trailing_zeros() as usize % WIDTH] |= 1 << ray;
+                        met &= met - 1;
+                    }
+                }
+                if children == 0 {
+                    continue;
+                }
+                let (squares, _) = tests.squares(single, slack, node, f32::INFINITY);
+                let base = search.fans.len();
+                while children != 0 {
+                    let child = children.trailing_zeros() as usize % WIDTH;
+                    children &= children - 1;
+                    let bound = squares[child].sqrt() * (1.0 - ROUNDING) - f32::MIN_POSITIVE;
+                    search.fans.push(FanEntry {
+                        first: node.first[child],
+                        count: node.count[child],
+                        bound,
+                        active: going[child],
+                    });
+                    // Insertion: the nearest on top.
+                    let mut at = search.fans.len() - 1;
+                    while at > base && search.fans[at - 1].bound < bound {
+                        search.fans.swap(at, at - 1);
+                        at -= 1;
+                    }
                 }
             }
-        }
-        for (slot, &member) in members.iter().enumerate() {
-            let (first, count) = if leaf(member) {
-                (nodes[member].first, nodes[member].count)
-            } else {
-                result.push(empty);
-                todo.push((member, result.len() - 1));
-                (result.len() as u32 - 1, 0)
-            };
-            let quad = &mut result[at];
-            for axis in 0..3 {
-                quad.low[axis][slot] = (nodes[member].low[axis] - padding) as f32;
-                quad.high[axis][slot] = (nodes[member].high[axis] + padding) as f32;
-            }
-            quad.first[slot] = first;
-            quad.count[slot] = count;
+            self.lengths.extend(&best[..directions.len()]);
         }
     }
-    result
-}
-
-/// Where a ray enters each of four boxes; infinite when it misses it or enters beyond `limit`.
-#[inline]
-fn quad_entries(quad: &Quad, origin: [f32; 3], inverse: [f32; 3], limit: f32) -> [f32; 4] {
-    // Comparisons rather than `min` and `max`: nothing is NaN here, and four of them are one instruction.
-    let lesser = |a: f32, b: f32| if a < b { a } else { b };
-    let greater = |a: f32, b: f32| if a > b { a } else { b };
-    let (mut enter, mut leave) = ([0.0_f32; 4], [limit; 4]);
-    for axis in 0..3 {
-        for i in 0..4 {
-            let a = (quad.low[axis][i] - origin[axis]) * inverse[axis];
-            let b = (quad.high[axis][i] - origin[axis]) * inverse[axis];
-            enter[i] = greater(enter[i], lesser(a, b));
-            leave[i] = lesser(leave[i], greater(a, b));
-        }
-    }
-    std::array::from_fn(|i| {
-        if enter[i] <= leave[i] {
-            enter[i]
-        } else {
-            f32::INFINITY
-        }
-    })
-}
-
-/// Distance along a ray to a triangle from either side, infinite for a miss (Möller and Trumbore 1997,
-/// *Fast, Minimum Storage Ray/Triangle Intersection*).
-#[inline]
-fn hit([a, ab, ac]: &[[f64; 3]; 3], origin: [f64; 3], direction: [f64; 3]) -> f64 {
-    let p = cross(direction, *ac);
-    let det = dot(*ab, p);
-    let sign = 1.0_f64.copysign(det);
-    let size = det.abs();
-    let s = sub(origin, *a);
-    let u = dot(s, p) * sign;
-    if u < 0.0 || u > size || size == 0.0 {
-        return f64::INFINITY;
-    }
-    let q = cross(s, *ab);
-    let v = dot(direction, q) * sign;
-    if v < 0.0 || u + v > size {
-        return f64::INFINITY;
-    }
-    let t = dot(*ac, q) / det;
-    if t > 0.0 { t } else { f64::INFINITY }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::Bvh;
+    use super::{Bvh, Search};
     use crate::mesh::{norm, scale, unit, zoo};
 
     #[test]
     fn rays_from_the_middle_of_a_sphere_travel_its_radius() {
         let mesh = zoo::sphere(3);
         let bvh = Bvh::new(&mesh);
+        let (mut search, mut lengths) = (Search::default(), Vec::new());
         let radius = norm(mesh.vertices[0]);
-        for direction in [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.3, 0.4, 0.5]] {
-            let t = bvh.cast([0.0; 3], unit(direction), u32::MAX).unwrap();
+        let directions = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.3, 0.4, 0.5]].map(unit);
+        bvh.cast(&mut search, [0.0; 3], &directions, u32::MAX, &mut lengths);
+        assert_eq!(lengths.len(), 3);
+        for t in &lengths {
             assert!((t - radius).abs() < 0.02 * radius, "{t} against {radius}");
-            // In the units of the direction.
-            let half = bvh
-                .cast([0.0; 3], scale(unit(direction), 2.0), u32::MAX)
-                .unwrap();
-            assert!((half - 0.5 * t).abs() < 1e-12);
         }
-        assert_eq!(bvh.cast([9.0, 0.0, 0.0], [1.0, 0.0, 0.0], u32::MAX), None);
+        // In the units of the direction.
+        let shorter = directions.map(|d| scale(d, 0.5));
+        let whole = lengths.clone();
+        bvh.cast(&mut search, [0.0; 3], &shorter, u32::MAX, &mut lengths);
+        for (twice, whole) in lengths.iter().zip(whole) {
+            assert!((twice - 2.0 * whole).abs() < 1e-12);
+        }
+        let away = [[1.0, 0.0, 0.0]];
+        bvh.cast(&mut search, [9.0, 0.0, 0.0], &away, u32::MAX, &mut lengths);
+        assert_eq!(lengths, [f64::INFINITY]);
+    }
+
+    #[test]
+    fn the_face_a_ray_starts_from_does_not_stop_it() {
+        let mesh = zoo::sphere(2);
+        let bvh = Bvh::new(&mesh);
+        let (mut search, mut lengths) = (Search::default(), Vec::new());
+        let corners = mesh.corners(7);
+        let middle = std::array::from_fn(|i| corners.iter().map(|c| c[i]).sum::<f64>() / 3.0);
+        let inward = [scale(unit(middle), -1.0)];
+        let origin = scale(middle, 1.0 + 1e-3);
+        bvh.cast(&mut search, origin, &inward, u32::MAX, &mut lengths);
+        assert!(lengths[0] < 2e-3);
+        bvh.cast(&mut search, origin, &inward, 7, &mut lengths);
+        assert!(lengths[0] > 1.8);
     }
 }
