@@ -122,6 +122,9 @@ impl<'a> BlockLanczos<'a> {
         } else {
             self.locked.remove(0, [&mut q, &mut w]);
             self.basis.remove(0, [&mut q, &mut w]);
+            // What was removed from both was common to them.
+            let common = gram(&q, &w, self.parallel);
+            add_product(&q, &negated(&common), &mut w, self.parallel);
         }
         self.clean = !self.clean;
         self.diagonal.push(symmetric_part(&d));
@@ -281,25 +284,39 @@ impl<'a> BlockLanczos<'a> {
     }
 
     /// Ritz vectors after one more application of the operator, which comes free: the columns of
-    /// `operator(V y) / θ`, a column of zeros for each `None`. Consumes the space.
+    /// `operator(V y) / θ = V y + Q c`, orthonormalised, and a column of zeros for each `None`.
+    /// Consumes the space.
     pub fn vectors(mut self, projection: &Projection, selected: &[Option<usize>]) -> Basis {
-        let blocks = self.diagonal.len();
+        let m = self.dimension();
         let next = std::mem::take(&mut self.next);
         self.basis.push(&next);
-        let coefficients: Vec<Vec<Tile>> = selected
+        // The columns below those of Y: of length (residual / θ), so far from 1 in the far pairs
+        // that C Cᵀ counts.
+        let chosen: Vec<usize> = selected.iter().flatten().copied().collect();
+        let c = Mat::from_fn(WIDTH, chosen.len(), |i, e| {
+            self.coupled(&projection.vectors, chosen[e])[i] / projection.values[chosen[e]]
+        });
+        let mut y = Mat::from_fn(m + WIDTH, chosen.len(), |i, e| match i < m {
+            true => projection.vectors[(i, chosen[e])],
+            false => c[(i - m, e)],
+        });
+        // (YᵀY + CᵀC)^(-1/2) = I - CᵀC / 2 + O(|C|⁴).
+        let along = &y * c.transpose();
+        y -= &along * c * faer::Scale(0.5);
+        let mut columns = y.col_iter();
+        let places: Vec<_> = selected
+            .iter()
+            .map(|e| e.and_then(|_| columns.next()))
+            .collect();
+        let coefficients: Vec<Vec<Tile>> = places
             .chunks(WIDTH)
             .map(|group| {
-                let mut tiles = vec![ZERO_TILE; blocks + 1];
-                for (column, e) in group.iter().enumerate() {
-                    let Some(e) = *e else { continue };
-                    for (b, tile) in tiles[..blocks].iter_mut().enumerate() {
-                        for (i, row) in tile.iter_mut().enumerate() {
-                            row.0[column] = projection.vectors[(b * WIDTH + i, e)];
-                        }
-                    }
-                    let coupled = self.coupled(&projection.vectors, e);
-                    for (row, x) in tiles[blocks].iter_mut().zip(coupled) {
-                        row.0[column] = x / projection.values[e];
+                let mut tiles = vec![ZERO_TILE; m / WIDTH + 1];
+                for (to, column) in group.iter().enumerate() {
+                    let Some(column) = column else { continue };
+                    let rows = tiles.iter_mut().flatten();
+                    for (row, &x) in rows.zip(column.iter()) {
+                        row.0[to] = x;
                     }
                 }
                 tiles

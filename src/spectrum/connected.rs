@@ -105,6 +105,12 @@ pub(super) fn dense(
     }
     let (j, limit, margin) = gap_after(&values, k, n).unwrap_or((n, f64::INFINITY, f64::INFINITY));
     let mut basis = Basis::new(n, j.div_ceil(WIDTH), setting.parallel);
+    // The null vector is known exactly: the others are made orthogonal to it, not to what came out.
+    let mut null = Basis::new(n, 1, setting.parallel);
+    if component.has_null_vector {
+        null.push(&zero_panel(n));
+        component.set_null_vector(&mut null);
+    }
     for first in (0..j).step_by(WIDTH) {
         let mut panel = zero_panel(n);
         for column in first..(first + WIDTH).min(j) {
@@ -112,6 +118,7 @@ pub(super) fn dense(
                 row.0[column - first] = vectors[(i, column)];
             }
         }
+        null.remove(0, [&mut panel]);
         basis.push(&panel);
     }
     if component.has_null_vector {

@@ -8,11 +8,17 @@ use super::component::{Component, Scratch};
 use super::connected::{Pairs, Setting};
 use crate::linalg::basis::Basis;
 use crate::linalg::dense_eigen::symmetric_eigen;
-use crate::linalg::panel::{Row, Tile, WIDTH, negated};
+use crate::linalg::panel::{Row, Tile, WIDTH, ZERO_TILE};
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 
 /// Pairs whose residuals are at most this share of what is allowed are left as they are.
 const GOOD_ENOUGH: f64 = 0.3;
+
+/// Inner products above this have squares that count.
+const SMALL_TURN: f64 = 1e-6;
+
+/// Eigenvalues within this ratio count as a cluster when errors are told apart.
+const CLUSTER: f64 = 1.5;
 
 /// Rounds of inverse iteration with a definite factor before a residual is given up.
 const MAX_POLISH: usize = 4;
@@ -123,6 +129,21 @@ fn polish(
     let x = Basis::of_columns(n, parallel, &[&pairs.vectors], &columns);
     let n_panels = k.div_ceil(WIDTH);
     let mut y = Basis::new(n, n_panels, parallel);
+    let null = component.has_null_vector;
+    let values = &pairs.values;
+    // An inner product g of y ≈ φ_f and x ≈ φ_r, which should be 0, is an error of either. As
+    // (S - σ) y is in the span of X_f, yᵀ (S - σ) x = 0 says whose: y has (λ_f - σ) / (λ_f - λ_r) g
+    // of φ_r, and x the rest of φ_f. Within a cluster any basis will do; the null vector is exact.
+    let separate = |g: f64, f: usize, r: usize| {
+        let (low, high) = (values[f].min(values[r]), values[f].max(values[r]));
+        if high <= CLUSTER * low || (null && r == 0) {
+            return (g, 0.0);
+        }
+        let of_y = (values[f] - shift) / (values[f] - values[r]) * g;
+        (of_y, g - of_y)
+    };
+    let mut largest_turn = 0.0f64;
+    let mut from_x = vec![vec![ZERO_TILE; pairs.vectors.n_panels()]; n_panels];
     // Scaled to about unit length, so that the Gram matrix below is well conditioned.
     let scales: Vec<f64> = poor.iter().map(|&i| pairs.values[i] - shift).collect();
     for (p, scales) in scales.chunks(WIDTH).enumerate() {
@@ -133,14 +154,17 @@ fn polish(
                 *x *= s;
             }
         }
-        if k < pairs.values.len() {
-            let [mut along] = pairs.vectors.project(0, [&panel]);
-            for &i in poor {
-                along[i / WIDTH][i % WIDTH] = Row::ZERO;
+        let [along] = pairs.vectors.project(0, [&panel]);
+        let mut from_y = vec![ZERO_TILE; along.len()];
+        for (c, &f) in poor[p * WIDTH..].iter().take(WIDTH).enumerate() {
+            for r in (0..pairs.values.len()).filter(|r| poor.binary_search(r).is_err()) {
+                let (of_y, of_x) = separate(along[r / WIDTH][r % WIDTH].0[c], f, r);
+                largest_turn = largest_turn.max(of_y.abs()).max(of_x.abs());
+                from_y[r / WIDTH][r % WIDTH].0[c] = -of_y;
+                from_x[p][r / WIDTH][c].0[r % WIDTH] = -of_x;
             }
-            let away: Vec<Tile> = along.iter().map(negated).collect();
-            pairs.vectors.add_combination(0, [&away], [&mut panel]);
         }
+        pairs.vectors.add_combination(0, [&from_y], [&mut panel]);
         y.push(&panel);
     }
     // In the span of Y: (S - σ) Y = X D with D the scales, so YᵀSY - σ YᵀY = Yᵀ X D.
@@ -161,6 +185,13 @@ fn polish(
         }
     }
     drop(x);
+    for r in 0..pairs.vectors.n_panels() {
+        let tiles: Vec<Tile> = from_x.iter().map(|tiles| tiles[r]).collect();
+        let mut panel = pairs.vectors.panel(r);
+        y.add_combination(0, [&tiles], [&mut panel]);
+        let rows = pairs.vectors.rows_of_mut(r).flatten();
+        rows.zip(panel).for_each(|(row, new)| *row = new);
+    }
     let (values, z) = generalised_eigen(&h, &g)?;
     let tile = |p: usize, b: usize| -> Tile {
         let entry = |i: usize, j: usize| match (b * WIDTH + i, p * WIDTH + j) {
@@ -180,7 +211,31 @@ fn polish(
             row.0[to % WIDTH] = x.0[from % WIDTH];
         }
     }
+    // What was removed was right to first order.
+    if largest_turn > SMALL_TURN {
+        orthonormalise(&mut pairs.vectors, pairs.values.len());
+    }
     Ok(())
+}
+
+/// `X ← X (3 I - XᵀX) / 2` for the first `k` columns: a Newton step to the nearest orthonormal ones.
+fn orthonormalise(vectors: &mut Basis, k: usize) {
+    let n_panels = vectors.n_panels();
+    let mut coefficients = vec![vec![ZERO_TILE; n_panels]; n_panels];
+    for p in 0..n_panels {
+        let [gram] = vectors.project(p, [&vectors.panel(p)]);
+        for (b, tile) in (p..n_panels).zip(gram) {
+            for i in 0..WIDTH.min(k - b * WIDTH) {
+                for j in 0..WIDTH.min(k - p * WIDTH) {
+                    let unit = if b == p && i == j { 1.5 } else { 0.0 };
+                    let entry = unit - 0.5 * tile[i].0[j];
+                    coefficients[p][b][i].0[j] = entry;
+                    coefficients[b][p][j].0[i] = entry;
+                }
+            }
+        }
+    }
+    vectors.transform(&coefficients);
 }
 
 /// `H z = μ G z` for symmetric H and definite G: values ascending, `zᵀ G z = I`.
