@@ -4,6 +4,7 @@ mod add;
 mod check;
 mod collections;
 mod config;
+mod correct;
 pub(crate) mod demo;
 mod demo_ply;
 pub(crate) mod describe;
@@ -14,6 +15,7 @@ mod json;
 mod labels;
 mod ls;
 mod map;
+mod merge;
 mod name;
 mod nearest;
 mod rm;
@@ -22,7 +24,9 @@ mod session;
 mod show;
 mod stats;
 mod stop;
+mod suggest;
 pub(crate) mod synth;
+mod undo;
 mod wait;
 mod watch;
 
@@ -132,6 +136,11 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Watch(args) => watch::run(args, session()?),
         Command::Events(args) => events::run(args, session()?),
         Command::Name(args) => name::run(args, session()?),
+        Command::Suggest(args) => suggest::run(args, session()?),
+        Command::Correct(args) => correct::run(args, session()?),
+        Command::Merge(args) => merge::merge(args, session()?),
+        Command::Split(args) => merge::split(args, session()?),
+        Command::Undo(args) => undo::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
         Command::Synth(args) => synth::run(args, cli.global.json)
             .map(|()| true)
