@@ -2,7 +2,7 @@
 
 mod corrections;
 
-pub(crate) use corrections::{Correct, Merge, Split, Suggest, Undo};
+pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
@@ -89,6 +89,8 @@ pub(crate) enum Command {
     Labels(Labels),
     /// Write labels, or coloured meshes, of a collection to a folder
     Export(Export),
+    /// Draw a collection in the colours of its labels, as one PNG
+    Render(Render),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
     /// List the shapes most like one shape

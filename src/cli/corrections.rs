@@ -67,3 +67,22 @@ pub(crate) struct Suggest {
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
+
+/// `coseg render`
+#[derive(Debug, Args)]
+pub(crate) struct Render {
+    /// The collection; may be left out if there is only one
+    #[arg(value_name = "COLLECTION", conflicts_with = "collection")]
+    pub(crate) name: Option<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// The PNG file to write
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+    /// At most this many shapes, in the order of their arrival
+    #[arg(long, value_name = "N")]
+    pub(crate) max: Option<usize>,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}

@@ -42,13 +42,7 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
         correction: Some(correction),
     };
     let frames: Vec<Bytes> = frames.finish();
-    let done = call!(
-        session.client,
-        CorrectLabels(request),
-        frames,
-        with_frames
-    )?
-    .0;
+    let done = call!(session.client, CorrectLabels(request), frames, with_frames)?.0;
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
     }
@@ -63,7 +57,11 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             "n_shapes": done.n_stale,
         }))?;
     } else {
-        let carried = if args.no_wait { "to be carried" } else { "carried" };
+        let carried = if args.no_wait {
+            "to be carried"
+        } else {
+            "carried"
+        };
         eprintln!(
             "{}: {:.1} % of its area changed; {carried} to {} shapes",
             args.shape,

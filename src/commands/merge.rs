@@ -39,7 +39,10 @@ pub(crate) fn split(args: &Split, mut session: Session) -> Outcome {
         session.print_json(&json::label(&label))?;
     } else {
         session.line(&label.id.to_string())?;
-        eprintln!("label {} is {} and {} now", args.label, args.label, label.id);
+        eprintln!(
+            "label {} is {} and {} now",
+            args.label, args.label, label.id
+        );
     }
     Ok(true)
 }

@@ -18,6 +18,7 @@ mod map;
 mod merge;
 mod name;
 mod nearest;
+mod render;
 mod rm;
 mod serve;
 mod session;
@@ -130,6 +131,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Show(args) => show::run(args, session()?),
         Command::Labels(args) => labels::run(args, session()?),
         Command::Export(args) => export::run(args, session()?),
+        Command::Render(args) => render::run(args, session()?),
         Command::Map(args) => map::run(args, session()?),
         Command::Nearest(args) => nearest::run(args, session()?),
         Command::Rm(args) => rm::run(args, session()?),

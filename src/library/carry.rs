@@ -5,11 +5,11 @@
 //! maps and from what was learnt, which stays as it is until the next correction.
 
 use super::commit::{collection_row, map_row, put_relabelled};
+use super::correct::{area_shares, pin_polygons};
 use super::lane::Lane;
 use super::learnt::Learnt;
 use super::place::{Known, MAX_MAPS, MAX_REPRESENTATIVES, Plan, next_recluster, sources_of};
 use super::relabel::{NewLabels, Relabelled, cause, moves};
-use super::correct::{area_shares, pin_polygons};
 use super::rows::{Teaching, damaged, quality_from_json, to_json};
 use super::{LabelId, Library, Result, Source, Up};
 use crate::fmap::{FunctionalMap, MapOptions};
@@ -149,7 +149,9 @@ impl Library {
             (self.known(id)?, Vec::new())
         };
         if !pins.is_empty() && pins.iter().all(|p| *p >= 0) {
-            self.store.catalog().write(|tx| -> Result<()> { Ok(tx.set_stale(id, false)?) })?;
+            self.store
+                .catalog()
+                .write(|tx| -> Result<()> { Ok(tx.set_stale(id, false)?) })?;
             lane.shapes[at].stale = false;
             return Ok(true);
         }
@@ -273,7 +275,10 @@ impl Library {
         };
         let position = |(at, _): (usize, f64)| chosen.iter().position(|c| *c == at);
         let exemplars = nearest(true, MAX_MAPS).into_iter();
-        exemplars.chain(nearest(false, MAX_MAPS)).filter_map(position).collect()
+        exemplars
+            .chain(nearest(false, MAX_MAPS))
+            .filter_map(position)
+            .collect()
     }
 
     /// Computes and keeps the maps from some pupils to one.
@@ -317,7 +322,11 @@ impl Library {
         if !teaching.closed {
             let discovered = self.resolved(lane, &teaching.discovered_labels)?;
             labels.extend(discovered);
-            labels = labels.into_iter().collect::<BTreeSet<_>>().into_iter().collect();
+            labels = labels
+                .into_iter()
+                .collect::<BTreeSet<_>>()
+                .into_iter()
+                .collect();
         }
         let k = labels.len();
         let mut model = LabelModel {
@@ -334,7 +343,8 @@ impl Library {
             }
         }
         let pupils = self.pupils(lane, &teaching, chosen, known, &model.labels)?;
-        let views: Vec<DescriptionView<'_>> = pupils.iter().map(|p| p.known.mapped.view()).collect();
+        let views: Vec<DescriptionView<'_>> =
+            pupils.iter().map(|p| p.known.mapped.view()).collect();
         let prepared: Vec<Prepared> = views.par_iter().map(|v| Prepared::new(v, &model)).collect();
         let lessons: Vec<Lesson<'_>> = pupils
             .iter()
@@ -441,9 +451,15 @@ impl Library {
         version: u64,
         labels: &[LabelId],
     ) -> Result<Vec<u8>> {
-        let old = self.store.catalog().read(|r| r.labels_at(known.row.id, version))?;
+        let old = self
+            .store
+            .catalog()
+            .read(|r| r.labels_at(known.row.id, version))?;
         let old = old.ok_or_else(|| {
-            damaged("label_versions", &format!("version {version} of {} is gone", known.row.id))
+            damaged(
+                "label_versions",
+                &format!("version {version} of {} is gone", known.row.id),
+            )
         })?;
         let n_old = teaching.discovered_labels.len();
         let resolved = self.resolved(lane, &teaching.discovered_labels)?;
@@ -514,7 +530,8 @@ impl Library {
                 given.accumulate(&of(&|f| pinned[f]), options.pinned_weight);
             }
             if let Some((_, version)) = version {
-                let old = self.discovered_probabilities(lane, teaching, &known, *version, &model.labels)?;
+                let old =
+                    self.discovered_probabilities(lane, teaching, &known, *version, &model.labels)?;
                 let most = |f: usize| {
                     let row = &old[f * k..(f + 1) * k];
                     let best = (0..k).max_by(|&a, &b| row[a].cmp(&row[b]).then(b.cmp(&a)))?;
@@ -587,7 +604,10 @@ impl Library {
     ) -> Result<Vec<(MapIn, Option<FunctionalMap>)>> {
         let mut kept = Vec::with_capacity(voters.len());
         for voter in voters {
-            let row = self.store.catalog().read(|r| r.map(voter.known.row.id, id))?;
+            let row = self
+                .store
+                .catalog()
+                .read(|r| r.map(voter.known.row.id, id))?;
             kept.push(match row {
                 Some(row) => Some(MapIn::of_row(row.p2p_21, &row.quality_json)?),
                 None => None,

@@ -280,7 +280,8 @@ fn polygon_labels(
         Correction::Whole(labels) => {
             if labels.len() != n {
                 let found = labels.len();
-                let message = format!("{found} labels were given, but shape {name:?} has {n} faces");
+                let message =
+                    format!("{found} labels were given, but shape {name:?} has {n} faces");
                 return Err(LibraryError::invalid("LABEL_COUNT", message));
             }
             let bad = labels.iter().position(|l| *l < -1 || *l > MAX_LABEL as i32);
@@ -311,7 +312,12 @@ fn polygon_labels(
         }
         Correction::Part { part, label } => {
             let label = in_range(*label)?;
-            let ids: Vec<u32> = known.labels.proxy_labels.iter().map(|l| *l as u32).collect();
+            let ids: Vec<u32> = known
+                .labels
+                .proxy_labels
+                .iter()
+                .map(|l| *l as u32)
+                .collect();
             let pieces = parts(&Surface::new(&view.mesh()), &ids);
             let Some(id) = pieces.label.get(*part as usize) else {
                 let n = pieces.label.len();
@@ -327,7 +333,8 @@ fn polygon_labels(
         }
     }
     if said.iter().all(|l| *l < 0) {
-        let message = format!("no face of shape {name:?} is given a label, so nothing is corrected");
+        let message =
+            format!("no face of shape {name:?} is given a label, so nothing is corrected");
         return Err(LibraryError::invalid("NOTHING_CORRECTED", message));
     }
     Ok(said)
@@ -337,7 +344,11 @@ fn polygon_labels(
 pub(super) fn pinned_share(view: &DescriptionView<'_>, pins: &[i32]) -> f64 {
     let area = view.polygon_area.iter().map(|a| f64::from(*a));
     let total: f64 = area.clone().sum();
-    let pinned: f64 = area.zip(pins).filter(|(_, p)| **p >= 0).map(|(a, _)| a).sum();
+    let pinned: f64 = area
+        .zip(pins)
+        .filter(|(_, p)| **p >= 0)
+        .map(|(a, _)| a)
+        .sum();
     pinned / total.max(1e-300)
 }
 
@@ -351,10 +362,20 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
         sources_json: known.labels.sources_json.clone(),
         ..LabelVersionRow::default()
     };
-    let labels: Vec<i32> = pins.iter().copied().filter(|p| *p >= 0).collect::<BTreeSet<_>>().into_iter().collect();
+    let labels: Vec<i32> = pins
+        .iter()
+        .copied()
+        .filter(|p| *p >= 0)
+        .collect::<BTreeSet<_>>()
+        .into_iter()
+        .collect();
     let class = |pin: &i32| labels.binary_search(pin).ok().map(|c| c as u32);
     let classes: Vec<Option<u32>> = pins.iter().map(class).collect();
-    for (label, pin) in row.proxy_labels.iter_mut().zip(proxy_pins(view, &classes, labels.len())) {
+    for (label, pin) in row
+        .proxy_labels
+        .iter_mut()
+        .zip(proxy_pins(view, &classes, labels.len()))
+    {
         if let Some(class) = pin {
             *label = labels[class as usize];
         }
@@ -383,7 +404,10 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
 
 /// Puts the labels that a person gave in the place of those that were found.
 pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
-    let slots = row.polygon_labels.iter_mut().zip(&mut row.polygon_confidence);
+    let slots = row
+        .polygon_labels
+        .iter_mut()
+        .zip(&mut row.polygon_confidence);
     for ((label, confidence), pin) in slots.zip(pins) {
         if *pin >= 0 {
             *label = *pin;

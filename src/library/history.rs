@@ -204,16 +204,21 @@ impl Library {
         let kept = self.store.catalog().read(|r| r.labels_before(correction))?;
         let mut out = Vec::new();
         for old in kept {
-            let is_there = |s: &&super::lane::KnownShape| {
-                s.id == old.shape && s.ordinal < rest.next_ordinal
-            };
+            let is_there =
+                |s: &&super::lane::KnownShape| s.id == old.shape && s.ordinal < rest.next_ordinal;
             if !lane.shapes.iter().any(|s| is_there(&s)) {
                 continue;
             }
             let known = self.known(old.shape)?;
-            let labels = self.store.catalog().read(|r| r.labels_at(old.shape, old.version))?;
+            let labels = self
+                .store
+                .catalog()
+                .read(|r| r.labels_at(old.shape, old.version))?;
             let labels = labels.ok_or_else(|| {
-                damaged("labels_before", &format!("version {} of {} is gone", old.version, old.shape))
+                damaged(
+                    "labels_before",
+                    &format!("version {} of {} is gone", old.version, old.shape),
+                )
             })?;
             let version = known.row.version + 1;
             let event = EventKind::LabelsChanged {
@@ -247,10 +252,9 @@ impl Library {
         request: Digest,
     ) -> Result<Option<Vec<u8>>> {
         let Some(key) = key else { return Ok(None) };
-        let there = self
-            .store
-            .catalog()
-            .read(|r| Ok::<_, LibraryError>(r.request(&key.client_id, &key.request_id)?.is_some()))?;
+        let there = self.store.catalog().read(|r| {
+            Ok::<_, LibraryError>(r.request(&key.client_id, &key.request_id)?.is_some())
+        })?;
         // Compares the requests.
         there
             .then(|| self.once(Some(key), request, |_| Ok(Vec::new())))

@@ -50,7 +50,8 @@ impl Library {
             let old = self.label_in_use(lane, label)?;
             self.label_in_use(lane, into)?;
             let change = |l: i32| if l == label as i32 { into as i32 } else { l };
-            let pinned = self.pins_changed(lane, |pins| pins.iter().map(|p| change(*p)).collect())?;
+            let pinned =
+                self.pins_changed(lane, |pins| pins.iter().map(|p| change(*p)).collect())?;
             let carrying = self
                 .store
                 .catalog()
@@ -59,9 +60,19 @@ impl Library {
             for shape in &carrying {
                 let known = self.known(shape.id)?;
                 let renamed = Renamed {
-                    proxy_labels: known.labels.proxy_labels.iter().map(|l| change(*l)).collect(),
+                    proxy_labels: known
+                        .labels
+                        .proxy_labels
+                        .iter()
+                        .map(|l| change(*l))
+                        .collect(),
                     proxy_probabilities: known.labels.proxy_probabilities.clone(),
-                    polygon_labels: known.labels.polygon_labels.iter().map(|l| change(*l)).collect(),
+                    polygon_labels: known
+                        .labels
+                        .polygon_labels
+                        .iter()
+                        .map(|l| change(*l))
+                        .collect(),
                 };
                 relabelled.push(renamed_labels(&known, renamed, cause::MERGE));
             }
@@ -139,7 +150,13 @@ impl Library {
                 .collect();
             let is_in: Vec<Vec<bool>> = known
                 .iter()
-                .map(|k| k.labels.proxy_labels.iter().map(|l| *l == label as i32).collect())
+                .map(|k| {
+                    k.labels
+                        .proxy_labels
+                        .iter()
+                        .map(|l| *l == label as i32)
+                        .collect()
+                })
                 .collect();
             let patches: Vec<&[u32]> = known.iter().map(|k| k.mapped.view().patches).collect();
             let Some(model) = split_model(&prepared, &patches, &is_in) else {
@@ -151,23 +168,41 @@ impl Library {
             let (mut labels, n_old) = (learnt.model.labels.clone(), learnt.model.labels.len());
             labels.push(new);
             let mut discovered = Vec::new();
-            for (((at, known), prepared), is_in) in chosen.iter().zip(&known).zip(&prepared).zip(&is_in) {
+            for (((at, known), prepared), is_in) in
+                chosen.iter().zip(&known).zip(&prepared).zip(&is_in)
+            {
                 let is_new = split_faces(&model, prepared, is_in);
                 let view = known.mapped.view();
                 let change = |p: usize, l: i32| match is_new[view.face_map[p] as usize] {
                     true if l == label as i32 => new as i32,
                     _ => l,
                 };
-                let proxy: Vec<i32> = known.labels.proxy_labels.iter().zip(&is_new).map(|(l, n)| if *n { new as i32 } else { *l }).collect();
+                let proxy: Vec<i32> = known
+                    .labels
+                    .proxy_labels
+                    .iter()
+                    .zip(&is_new)
+                    .map(|(l, n)| if *n { new as i32 } else { *l })
+                    .collect();
                 let renamed = Renamed {
                     proxy_probabilities: with_new_class(&known.labels, n_old, &labels, &proxy),
                     proxy_labels: proxy,
-                    polygon_labels: known.labels.polygon_labels.iter().enumerate().map(|(p, l)| change(p, *l)).collect(),
+                    polygon_labels: known
+                        .labels
+                        .polygon_labels
+                        .iter()
+                        .enumerate()
+                        .map(|(p, l)| change(p, *l))
+                        .collect(),
                 };
                 let shape = &lane.shapes[*at];
                 if shape.pinned {
                     let pins = self.pinned(shape.id)?.1;
-                    let pins: Vec<i32> = pins.iter().enumerate().map(|(p, l)| change(p, *l)).collect();
+                    let pins: Vec<i32> = pins
+                        .iter()
+                        .enumerate()
+                        .map(|(p, l)| change(p, *l))
+                        .collect();
                     pinned.push((shape.id, pins));
                 }
                 discovered.push((shape.ordinal, known.row.version + 1));
@@ -281,7 +316,10 @@ fn put_changes(
         tx.set_pins(*shape, Some(pins))?;
     }
     for shape in relabelled {
-        let (epoch, stale) = (shape.labels.summary.label_epoch, tx.shape(shape.shape)?.is_some_and(|s| s.stale));
+        let (epoch, stale) = (
+            shape.labels.summary.label_epoch,
+            tx.shape(shape.shape)?.is_some_and(|s| s.stale),
+        );
         put_relabelled(tx, id, shape, &[], epoch)?;
         tx.set_stale(shape.shape, stale)?;
     }
@@ -324,7 +362,11 @@ fn renamed_labels(known: &Known, renamed: Renamed, cause: &'static str) -> Relab
         parts_json: to_json(&infos),
         area_shares: area_shares(&view, &row.polygon_labels),
     };
-    let moved = moves(&known.labels.polygon_labels, &row.polygon_labels, view.polygon_area);
+    let moved = moves(
+        &known.labels.polygon_labels,
+        &row.polygon_labels,
+        view.polygon_area,
+    );
     Relabelled {
         shape: known.row.id,
         name: known.row.name.clone(),
@@ -339,9 +381,14 @@ fn with_new_class(old: &LabelVersionRow, k: usize, labels: &[LabelId], proxy: &[
     let mut out = vec![0; proxy.len() * (k + 1)];
     let new = labels[k] as i32;
     for (f, row) in out.chunks_exact_mut(k + 1).enumerate() {
-        let was = old.proxy_probabilities.get(f * k..(f + 1) * k).unwrap_or(&[]);
+        let was = old
+            .proxy_probabilities
+            .get(f * k..(f + 1) * k)
+            .unwrap_or(&[]);
         row[..was.len()].copy_from_slice(was);
-        let class = labels.iter().position(|l| i64::from(*l) == i64::from(old.proxy_labels[f]));
+        let class = labels
+            .iter()
+            .position(|l| i64::from(*l) == i64::from(old.proxy_labels[f]));
         if let (true, Some(class)) = (proxy[f] == new, class) {
             row.swap(class, k);
         }

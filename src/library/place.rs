@@ -101,9 +101,7 @@ impl Library {
                 (maps, sources) = (taught.maps, taught.sources);
                 taught.plan
             }
-            (None, Some(labelling), Some(learnt)) if !due => {
-                grown(lane, learnt, labelling, &view)
-            }
+            (None, Some(labelling), Some(learnt)) if !due => grown(lane, learnt, labelling, &view),
             (None, labelling, _) => self.reclustered(lane, &view, labelling)?,
         };
         lap("recluster");

@@ -355,7 +355,11 @@ impl Library {
         })
     }
 
-    pub(super) fn shape_row(&self, collection: &str, shape: &str) -> Result<(CollectionRow, ShapeRow)> {
+    pub(super) fn shape_row(
+        &self,
+        collection: &str,
+        shape: &str,
+    ) -> Result<(CollectionRow, ShapeRow)> {
         self.store.catalog().read(|r| {
             let row = require_collection(r, collection)?;
             let found = r.shape_by_name(row.id, shape)?;

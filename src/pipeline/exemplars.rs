@@ -94,8 +94,12 @@ pub fn teach(
     let mut certain = given.clone();
     for lesson in lessons.iter().filter(|l| !l.pinned.is_empty()) {
         let class = |f: usize| lesson.pinned[f];
-        let of_shape =
-            Statistics::of_shape(&lesson.prepared.features, &lesson.prepared.surface.area, class, k);
+        let of_shape = Statistics::of_shape(
+            &lesson.prepared.features,
+            &lesson.prepared.surface.area,
+            class,
+            k,
+        );
         certain.accumulate(&of_shape, options.pinned_weight);
     }
     let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
@@ -103,7 +107,11 @@ pub fn teach(
     let mut labellings = Vec::new();
     for round in 0..=options.n_rounds {
         let classifier = statistics.classifier();
-        let share = if round == 0 { options.vote_share.0 } else { options.vote_share.1 };
+        let share = if round == 0 {
+            options.vote_share.0
+        } else {
+            options.vote_share.1
+        };
         labellings = (0..lessons.len())
             .map(|to| {
                 let lesson = &lessons[to];
@@ -128,7 +136,13 @@ pub fn teach(
                     vote_share: share,
                     pinned: lesson.pinned,
                 };
-                labelled(&lesson.shape, lesson.prepared, &evidence, k, options.strength)
+                labelled(
+                    &lesson.shape,
+                    lesson.prepared,
+                    &evidence,
+                    k,
+                    options.strength,
+                )
             })
             .collect();
         if round < options.n_rounds {
@@ -158,7 +172,13 @@ pub fn label_taught(
         vote_share: options.vote_share.1,
         pinned,
     };
-    labelled(shape, prepared, &evidence, statistics.counts.len(), options.strength)
+    labelled(
+        shape,
+        prepared,
+        &evidence,
+        statistics.counts.len(),
+        options.strength,
+    )
 }
 
 /// Classes of proxy faces `(m,)`, given those of the polygons `(n_polygons,)`: a face is pinned if most of the area that
@@ -218,8 +238,12 @@ fn with_confident(
             let confident = labelling.probabilities[f * k + class as usize] >= least;
             (confident && !is_pinned).then_some(class)
         };
-        let of_shape =
-            Statistics::of_shape(&lesson.prepared.features, &lesson.prepared.surface.area, class, k);
+        let of_shape = Statistics::of_shape(
+            &lesson.prepared.features,
+            &lesson.prepared.surface.area,
+            class,
+            k,
+        );
         carried.accumulate(&of_shape, 1.0);
     }
     let total = |s: &Statistics| s.counts.iter().sum::<f64>();

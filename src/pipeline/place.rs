@@ -155,7 +155,11 @@ pub fn label(
 }
 
 /// Label probabilities of each face `(m, k)` by the votes, and the weight of each vote.
-pub(super) fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f64>, Vec<f64>) {
+pub(super) fn carried(
+    shape: &DescriptionView<'_>,
+    votes: &[Vote<'_>],
+    k: usize,
+) -> (Vec<f64>, Vec<f64>) {
     let Some(least) = votes.iter().map(|v| v.residual).min_by(f64::total_cmp) else {
         return (Vec::new(), Vec::new());
     };

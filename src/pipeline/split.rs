@@ -44,7 +44,12 @@ pub fn split_model(
         return None;
     }
     let mut group = kmeans(&points, dim, &weights, 2, SEED, N_STARTS);
-    let second: f64 = group.iter().zip(&weights).filter(|(g, _)| **g == 1).map(|(_, w)| w).sum();
+    let second: f64 = group
+        .iter()
+        .zip(&weights)
+        .filter(|(g, _)| **g == 1)
+        .map(|(_, w)| w)
+        .sum();
     if 2.0 * second > weights.iter().sum() {
         group.iter_mut().for_each(|g| *g = 1 - *g);
     }
@@ -62,13 +67,25 @@ pub fn split_model(
 
 /// Which faces `(m,)` of a shape take the new label, among those that carry the old one.
 pub fn split_faces(model: &Classifier, shape: &Prepared, is_in: &[bool]) -> Vec<bool> {
-    let inside = shape.surface.edges.iter().filter(|e| e.faces.iter().all(|f| is_in[*f as usize]));
+    let inside = shape
+        .surface
+        .edges
+        .iter()
+        .filter(|e| e.faces.iter().all(|f| is_in[*f as usize]));
     let surface = Surface {
         area: shape.surface.area.clone(),
         centroids: Vec::new(),
         edges: inside.copied().collect(),
     };
-    let unary: Vec<f64> = model.log_probabilities(&shape.features).iter().map(|p| -p).collect();
+    let unary: Vec<f64> = model
+        .log_probabilities(&shape.features)
+        .iter()
+        .map(|p| -p)
+        .collect();
     let classes = cut(&surface, &unary, 2, STRENGTH, None);
-    classes.iter().zip(is_in).map(|(class, is_in)| *is_in && *class == 1).collect()
+    classes
+        .iter()
+        .zip(is_in)
+        .map(|(class, is_in)| *is_in && *class == 1)
+        .collect()
 }

@@ -72,14 +72,16 @@ fn one_corrected_shape_labels_all_others_by_its_ids() {
     let created = at(&|k| *k == EventKind::LabelCreated { label: 10 }).unwrap();
     let retired = at(&|k| *k == EventKind::LabelRetired { label: 0 }).unwrap();
     let corrected = at(&|k| matches!(k, EventKind::Corrected { .. })).unwrap();
-    let carried = kinds.iter().filter(
-        |k| matches!(k, EventKind::LabelsChanged { cause, .. } if cause == "carrying"),
-    );
+    let carried = kinds
+        .iter()
+        .filter(|k| matches!(k, EventKind::LabelsChanged { cause, .. } if cause == "carrying"));
     assert!(created < corrected && retired < corrected);
     assert_eq!(carried.count(), 6);
-    assert!(kinds[corrected + 1..]
-        .iter()
-        .all(|k| matches!(k, EventKind::LabelsChanged { .. })));
+    assert!(
+        kinds[corrected + 1..]
+            .iter()
+            .all(|k| matches!(k, EventKind::LabelsChanged { .. }))
+    );
 
     // Shapes that come later have the same ids, also after the library was closed.
     let before = all_labels(&library);
@@ -99,7 +101,9 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     let snapshot = |library: &Library| -> BTreeMap<String, (Vec<i32>, Vec<f32>)> {
         let (_, shapes) = library.labels_snapshot(COLLECTION).unwrap();
         let shapes = shapes.into_iter();
-        shapes.map(|(name, l)| (name, (l.labels, l.confidence))).collect()
+        shapes
+            .map(|(name, l)| (name, (l.labels, l.confidence)))
+            .collect()
     };
     let mut states = vec![snapshot(&library)];
     correct(&library, &shapes[0]);
@@ -112,7 +116,10 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     library.merge_labels(COLLECTION, 11, 12, None).unwrap();
 
     let undo = || library.undo(COLLECTION, None).unwrap();
-    assert_eq!((undo().change, undo().change), ("merge".into(), "correct".into()));
+    assert_eq!(
+        (undo().change, undo().change),
+        ("merge".into(), "correct".into())
+    );
     assert_eq!(snapshot(&library), states[1]);
     let name = |id: u32| {
         let labels = library.collection(COLLECTION).unwrap().labels;
@@ -132,7 +139,13 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     assert!(newcomer.0.iter().all(|l| (0..3).contains(l)));
     let nothing = library.undo(COLLECTION, None);
     assert!(
-        matches!(&nothing, Err(LibraryError::FailedPrecondition { reason: "NOTHING_TO_UNDO", .. })),
+        matches!(
+            &nothing,
+            Err(LibraryError::FailedPrecondition {
+                reason: "NOTHING_TO_UNDO",
+                ..
+            })
+        ),
         "{nothing:?}"
     );
     // And the collection lives on.
@@ -148,8 +161,13 @@ fn pinned_faces_never_change_by_themselves() {
     stream(&library, &shapes[..4]);
     // A tenth of one shape, at random as far as its parts are concerned.
     let faces: Vec<u32> = (0..shapes[1].labels.len() as u32).step_by(10).collect();
-    let some = Correction::Faces { faces: faces.clone(), label: 77 };
-    library.correct(COLLECTION, &shapes[1].name, &some, None).unwrap();
+    let some = Correction::Faces {
+        faces: faces.clone(),
+        label: 77,
+    };
+    library
+        .correct(COLLECTION, &shapes[1].name, &some, None)
+        .unwrap();
     carry(&library);
     let kept = |library: &Library| {
         let labels = &all_labels(library)[&shapes[1].name];
@@ -157,7 +175,10 @@ fn pinned_faces_never_change_by_themselves() {
     };
     assert!(kept(&library));
     let others: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
-    assert!(others.len() > 1, "a correction of a tenth leaves other labels: {others:?}");
+    assert!(
+        others.len() > 1,
+        "a correction of a tenth leaves other labels: {others:?}"
+    );
     correct(&library, &shapes[3]);
     stream(&library, &shapes[4..9]);
     assert!(kept(&library));
@@ -170,8 +191,13 @@ fn pinned_faces_never_change_by_themselves() {
         assert_eq!(all_labels(&library)[&s.name], truth(s));
     }
     // Only a person changes them.
-    let part = Correction::Faces { faces: vec![faces[0]], label: 78 };
-    library.correct(COLLECTION, &shapes[1].name, &part, None).unwrap();
+    let part = Correction::Faces {
+        faces: vec![faces[0]],
+        label: 78,
+    };
+    library
+        .correct(COLLECTION, &shapes[1].name, &part, None)
+        .unwrap();
     assert_eq!(all_labels(&library)[&shapes[1].name][faces[0] as usize], 78);
 }
 
@@ -194,7 +220,10 @@ fn the_same_correction_again_has_one_effect_and_the_same_reply() {
     let other = library.correct(COLLECTION, &shapes[1].name, &correction, Some(&key));
     assert!(matches!(
         other,
-        Err(LibraryError::FailedPrecondition { reason: "REQUEST_ID_REUSED", .. })
+        Err(LibraryError::FailedPrecondition {
+            reason: "REQUEST_ID_REUSED",
+            ..
+        })
     ));
 }
 
@@ -210,16 +239,52 @@ fn wrong_corrections_are_refused_and_change_nothing() {
     range[7] = -2;
     let mut large = vec![0; n];
     large[9] = 65_536;
-    let faces = |f: u32, label: u32| Correction::Faces { faces: vec![f], label };
+    let faces = |f: u32, label: u32| Correction::Faces {
+        faces: vec![f],
+        label,
+    };
     for (correction, message) in [
-        (Correction::Whole(vec![1; n - 1]), format!("{} labels were given, but shape {name:?} has {n} faces", n - 1)),
-        (Correction::Whole(range), "the label of face 7 is -2, but must be -1 to 65535".into()),
-        (Correction::Whole(large), "the label of face 9 is 65536, but must be -1 to 65535".into()),
-        (Correction::Whole(vec![-1; n]), format!("no face of shape {name:?} is given a label, so nothing is corrected")),
-        (Correction::Whole((0..n as i32).map(|i| i % 65).collect()), format!("collection {COLLECTION:?} would have 65 labels, the limit is 64")),
-        (faces(n as u32, 1), format!("face {n} is named, but shape {name:?} has {n}")),
-        (faces(0, 65_536), "the label is 65536, but must be at most 65535".into()),
-        (Correction::Part { part: 999, label: 1 }, format!("part 999 is named, but shape {name:?} has {}", library.shape(COLLECTION, name).unwrap().parts.len())),
+        (
+            Correction::Whole(vec![1; n - 1]),
+            format!(
+                "{} labels were given, but shape {name:?} has {n} faces",
+                n - 1
+            ),
+        ),
+        (
+            Correction::Whole(range),
+            "the label of face 7 is -2, but must be -1 to 65535".into(),
+        ),
+        (
+            Correction::Whole(large),
+            "the label of face 9 is 65536, but must be -1 to 65535".into(),
+        ),
+        (
+            Correction::Whole(vec![-1; n]),
+            format!("no face of shape {name:?} is given a label, so nothing is corrected"),
+        ),
+        (
+            Correction::Whole((0..n as i32).map(|i| i % 65).collect()),
+            format!("collection {COLLECTION:?} would have 65 labels, the limit is 64"),
+        ),
+        (
+            faces(n as u32, 1),
+            format!("face {n} is named, but shape {name:?} has {n}"),
+        ),
+        (
+            faces(0, 65_536),
+            "the label is 65536, but must be at most 65535".into(),
+        ),
+        (
+            Correction::Part {
+                part: 999,
+                label: 1,
+            },
+            format!(
+                "part 999 is named, but shape {name:?} has {}",
+                library.shape(COLLECTION, name).unwrap().parts.len()
+            ),
+        ),
     ] {
         let refused = library.correct(COLLECTION, name, &correction, None);
         assert_eq!(refused.unwrap_err().to_string(), message);
@@ -235,10 +300,18 @@ fn a_part_is_corrected_as_a_whole() {
     let name = &shapes[0].name;
     let part = &library.shape(COLLECTION, name).unwrap().parts[1];
     let correction = Correction::Part { part: 1, label: 40 };
-    let done = library.correct(COLLECTION, name, &correction, None).unwrap();
-    assert!((done.area_share - part.area_share).abs() < 0.05, "{done:?} {part:?}");
+    let done = library
+        .correct(COLLECTION, name, &correction, None)
+        .unwrap();
+    assert!(
+        (done.area_share - part.area_share).abs() < 0.05,
+        "{done:?} {part:?}"
+    );
     carry(&library);
-    let there = all_labels(&library)[name].iter().filter(|l| **l == 40).count();
+    let there = all_labels(&library)[name]
+        .iter()
+        .filter(|l| **l == 40)
+        .count();
     assert!(there as u64 >= done.n_faces);
 }
 
@@ -262,13 +335,19 @@ fn labels_are_merged_and_split_on_all_shapes() {
     let old = old.iter().find(|l| l.id == 10).unwrap();
     assert_eq!((old.merged_into, old.n_shapes), (Some(11), 0));
     let again = library.merge_labels(COLLECTION, 10, 12, None);
-    assert_eq!(again.unwrap_err().to_string(), "label 10 was merged into 11");
+    assert_eq!(
+        again.unwrap_err().to_string(),
+        "label 10 was merged into 11"
+    );
 
     let since = sequence(&library);
     let (new, n) = library.split_label(COLLECTION, 11, None).unwrap();
     assert!(n > 0 && new.id > 12, "{new:?}");
     carry(&library);
-    let split = EventKind::LabelSplit { from: 11, into: vec![new.id] };
+    let split = EventKind::LabelSplit {
+        from: 11,
+        into: vec![new.id],
+    };
     assert!(kinds(&library, since).contains(&split));
     let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
     assert_eq!(used, BTreeSet::from([11, 12, new.id as i32]));
@@ -292,7 +371,9 @@ fn an_addition_after_a_correction_computes_few_maps_and_relabels_nobody() {
     }
     carry(&library);
     let before = all_labels(&library);
-    let placed = library.add(COLLECTION, file(&shapes[7].name, &shapes[7].mesh)).unwrap();
+    let placed = library
+        .add(COLLECTION, file(&shapes[7].name, &shapes[7].mesh))
+        .unwrap();
     assert_eq!((placed.n_maps as usize, placed.n_relabelled), (MAX_MAPS, 0));
     let mut after = all_labels(&library);
     after.remove(&shapes[7].name);
@@ -334,11 +415,17 @@ fn the_next_suggestion_is_never_one_that_was_corrected() {
         let next = library.suggest(COLLECTION).unwrap();
         assert_eq!(next.n_corrected, n);
         assert!(seen.insert(next.shape.clone()) && !next.reason.is_empty());
-        correct(&library, shapes.iter().find(|s| s.name == next.shape).unwrap());
+        correct(
+            &library,
+            shapes.iter().find(|s| s.name == next.shape).unwrap(),
+        );
         carry(&library);
     }
     let none = library.suggest(COLLECTION).unwrap_err().to_string();
-    assert_eq!(none, "collection \"shapes\" has 4 shapes, and a person labelled 4 of them");
+    assert_eq!(
+        none,
+        "collection \"shapes\" has 4 shapes, and a person labelled 4 of them"
+    );
 }
 
 #[test]

@@ -94,20 +94,20 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 2");
+    change("PRAGMA user_version = 3");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 2,
-                supported: 1,
+                found: 3,
+                supported: 2,
                 ..
             }
         ),
         "{newer}"
     );
-    change("PRAGMA user_version = 1; PRAGMA application_id = 7");
+    change("PRAGMA user_version = 2; PRAGMA application_id = 7");
     assert!(Store::open(&library).err().expect("refused").is_damage());
     let other = dir.path().join("other");
     std::fs::create_dir(&other).expect("created");
