@@ -1,6 +1,5 @@
 //! A person says that two labels are one, or that one is two.
 
-use super::carry::pupils;
 use super::collections::find_label;
 use super::commit::{collection_row, event, put_relabelled};
 use super::correct::area_shares;
@@ -10,6 +9,7 @@ use super::learnt::Learnt;
 use super::place::Known;
 use super::relabel::{NewLabels, Relabelled, cause, moves};
 use super::rows::{CollectionState, label_colour, to_json};
+use super::teach::pupils;
 use super::{EventKind, LabelId, LabelInfo, Library, LibraryError, PartInfo, RequestKey, Result};
 use crate::correspondence::parts;
 use crate::labels::LabelModel;

@@ -43,6 +43,7 @@ mod relabel;
 mod rows;
 mod submit;
 mod suggest;
+mod teach;
 mod types;
 
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};

@@ -2,8 +2,8 @@
 //!
 //! While nothing is labelled by hand, labels are discovered; from the first correction on they come from the
 //! corrected shapes, the exemplars. A few representative shapes learn first, together: votes through maps from
-//! the exemplars, and a linear discriminant that is trained on the exemplars alone, label them; then for two
-//! rounds the discriminant is trained anew with the confident faces of all of them (Yarowsky 1995, *Unsupervised
+//! the exemplars, and a linear discriminant that is trained on the exemplars alone, label them; then once more,
+//! with the discriminant trained anew with the confident faces of all of them (Yarowsky 1995, *Unsupervised
 //! Word Sense Disambiguation Rivaling Supervised Methods*), and they vote for each other. What they have
 //! learnt labels every other shape with a vote and a cut: it does not change until the next correction, so the
 //! order in which those are labelled makes no difference.
@@ -12,6 +12,7 @@ use super::place::{FLOOR, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::labels::cut::cut;
 use crate::labels::{Classifier, Statistics};
+use rayon::iter::{IntoParallelIterator, ParallelIterator};
 
 /// Weights of teaching.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,8 +20,8 @@ pub struct TeachOptions {
     /// Rounds in which the representatives learn from each other, after the one in which they learn from the
     /// exemplars alone.
     pub n_rounds: usize,
-    /// Share of the vote through maps in the log-linear mean with the discriminant: in the first round, later.
-    pub vote_share: (f64, f64),
+    /// Share of the vote through maps in the log-linear mean with the discriminant.
+    pub vote_share: f64,
     /// Weight of an exemplar's vote against that of a shape that was labelled by carrying.
     pub exemplar_trust: f64,
     /// Weight in the discriminant of a face that a person labelled, against one whose label was discovered.
@@ -36,8 +37,8 @@ pub struct TeachOptions {
 impl Default for TeachOptions {
     fn default() -> Self {
         Self {
-            n_rounds: 2,
-            vote_share: (0.5, 0.5),
+            n_rounds: 1,
+            vote_share: 0.5,
             exemplar_trust: 2.0,
             pinned_weight: 4.0,
             carried_weight: 1.0,
@@ -107,12 +108,8 @@ pub fn teach(
     let mut labellings = Vec::new();
     for round in 0..=options.n_rounds {
         let classifier = statistics.classifier();
-        let share = if round == 0 {
-            options.vote_share.0
-        } else {
-            options.vote_share.1
-        };
         labellings = (0..lessons.len())
+            .into_par_iter()
             .map(|to| {
                 let lesson = &lessons[to];
                 let into: Vec<Vote<'_>> = maps
@@ -133,7 +130,7 @@ pub fn teach(
                 let evidence = Evidence {
                     classifier: &classifier,
                     votes: &into,
-                    vote_share: share,
+                    vote_share: options.vote_share,
                     pinned: lesson.pinned,
                 };
                 labelled(
@@ -169,7 +166,7 @@ pub fn label_taught(
     let evidence = Evidence {
         classifier: &statistics.classifier(),
         votes,
-        vote_share: options.vote_share.1,
+        vote_share: options.vote_share,
         pinned,
     };
     labelled(

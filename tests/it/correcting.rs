@@ -444,3 +444,31 @@ fn without_its_exemplar_a_collection_keeps_its_labels() {
     let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
     assert_eq!(used, (10..13).collect());
 }
+
+#[test]
+fn any_order_of_arrival_ends_within_a_point_of_the_batch() {
+    let shapes = family(Family::Pliers, 32, 8, &SMALL);
+    let run = |order: &[usize], corrected_at: usize| {
+        let (_folder, library) = library(3, Up::Unknown);
+        for (n, at) in order.iter().enumerate() {
+            stream(&library, &shapes[*at..=*at]);
+            if n == corrected_at {
+                correct(&library, &shapes[0]);
+            }
+        }
+        carry(&library);
+        right(&library, &shapes, &[&shapes[0].name])
+    };
+    // All shapes are known when the person speaks; against: the first of a stream, forwards and backwards.
+    let batch = run(&[0, 1, 2, 3, 4, 5, 6, 7], 7);
+    let streamed = [
+        run(&[0, 1, 2, 3, 4, 5, 6, 7], 0),
+        run(&[0, 7, 6, 5, 4, 3, 2, 1], 0),
+    ];
+    for score in streamed {
+        assert!(
+            (score - batch).abs() <= 0.01,
+            "{streamed:?} against {batch:.4}"
+        );
+    }
+}
