@@ -85,6 +85,40 @@ fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
 }
 
 #[test]
+fn a_catalog_of_format_1_is_brought_to_format_2() -> Result<()> {
+    let (_dir, store) = opened();
+    let library = store.dir().to_path_buf();
+    drop(store);
+    let catalog = library.join("catalog.db");
+    let format = || -> u32 {
+        let connection = rusqlite::Connection::open(&catalog).expect("opens");
+        connection
+            .pragma_query_value(None, "user_version", |row| row.get(0))
+            .expect("a number")
+    };
+    rusqlite::Connection::open(&catalog)
+        .expect("opens")
+        .execute_batch(
+            "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;
+             PRAGMA user_version = 1",
+        )
+        .expect("runs");
+    let store = Store::open(&library)?;
+    assert_eq!(format(), 2);
+    let new = coseg::store::NewCollection {
+        name: "old".into(),
+        ..Default::default()
+    };
+    let left = store.catalog().write(|tx| {
+        let id = tx.insert_collection(&new)?;
+        tx.insert_correction(id, "name", "{}", b"before")?;
+        tx.n_corrections(id)
+    })?;
+    assert_eq!(left, 1);
+    Ok(())
+}
+
+#[test]
 fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
     let (dir, store) = opened();
     let library = store.dir().to_path_buf();
