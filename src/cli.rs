@@ -1,5 +1,9 @@
 //! What was typed becomes one command with typed flags.
 
+mod corrections;
+
+pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
@@ -85,6 +89,8 @@ pub(crate) enum Command {
     Labels(Labels),
     /// Write labels, or coloured meshes, of a collection to a folder
     Export(Export),
+    /// Draw a collection in the colours of its labels, as one PNG
+    Render(Render),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
     /// List the shapes most like one shape
@@ -95,8 +101,18 @@ pub(crate) enum Command {
     Watch(Watch),
     /// List events of a collection's log
     Events(Events),
+    /// Say which shape is worth labelling by hand next, and why
+    Suggest(Suggest),
+    /// Label a shape by hand, and carry that to all others
+    Correct(Correct),
     /// Give a label a name
     Name(Name),
+    /// Make one label of two
+    Merge(Merge),
+    /// Make two labels of one
+    Split(Split),
+    /// Take back the newest correction, name, merge or split; repeat to go further back
+    Undo(Undo),
     /// Create or delete collections
     #[command(subcommand)]
     Collections(Collections),

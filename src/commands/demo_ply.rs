@@ -131,6 +131,7 @@ mod tests {
             name: String::new(),
             colour_rgb: 0x01_02_03,
             merged_into: None,
+            n_shapes: 1,
         }];
         let files = files(&[(&a, &[5]), (&b, &[-1])], &infos);
         let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();

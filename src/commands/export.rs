@@ -90,7 +90,7 @@ fn at(path: &Path, source: std::io::Error) -> CommandError {
 }
 
 /// The mesh of a shape as it was sent.
-fn original(
+pub(super) fn original(
     session: &mut Session,
     collection: &str,
     shape: &str,

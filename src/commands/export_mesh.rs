@@ -81,6 +81,7 @@ mod tests {
             name,
             colour_rgb: 0x01_02_ff,
             merged_into: None,
+            n_shapes: 1,
         }]
     }
 

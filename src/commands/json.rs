@@ -53,6 +53,7 @@ pub(crate) fn label(l: &wire::LabelInfo) -> Value {
         "name": Some(&l.name).filter(|n| !n.is_empty()),
         "colour": colour(l.colour_rgb),
         "merged_into": l.merged_into,
+        "n_shapes": l.n_shapes,
     })
 }
 
@@ -173,6 +174,17 @@ pub(crate) fn event(e: &wire::Event) -> Value {
         Some(Kind::LabelMerged(m)) => ("label_merged", json!({ "from": m.from, "into": m.into })),
         Some(Kind::LabelSplit(s)) => ("label_split", json!({ "from": s.from, "into": s.into })),
         Some(Kind::LabelNamed(n)) => ("label_named", json!({ "label": n.label, "name": n.name })),
+        Some(Kind::LabelRetired(l)) => ("label_retired", json!({ "label": l.label })),
+        Some(Kind::Corrected(c)) => {
+            let body = json!({
+                "shape": c.shape,
+                "version": c.version,
+                "n_faces": c.n_faces,
+                "area_share": c.area_share,
+            });
+            ("corrected", body)
+        }
+        Some(Kind::Undone(u)) => ("undone", json!({ "change": u.change })),
         Some(Kind::Reclustered(r)) => {
             let body = json!({
                 "score_before": r.score_before,
@@ -230,6 +242,15 @@ pub(crate) fn event_line(e: &wire::Event) -> String {
         Some(Kind::LabelMerged(m)) => format!("label {} merged into {}", m.from, m.into),
         Some(Kind::LabelSplit(s)) => format!("label {} split into {:?}", s.from, s.into),
         Some(Kind::LabelNamed(n)) => format!("label {} named {:?}", n.label, n.name),
+        Some(Kind::LabelRetired(l)) => format!("label {} out of use", l.label),
+        Some(Kind::Corrected(c)) => format!(
+            "{} corrected, version {}, {} faces ({}) labelled by hand",
+            c.shape,
+            c.version,
+            c.n_faces,
+            percent(c.area_share)
+        ),
+        Some(Kind::Undone(u)) => format!("{} undone", u.change),
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
             let before = r

@@ -36,7 +36,7 @@ fn collections(session: &mut Session) -> Outcome {
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
     for c in &reply.collections {
         let spec = c.spec.clone().unwrap_or_default();
-        let n_labels = c.labels.iter().filter(|l| l.merged_into.is_none()).count();
+        let n_labels = c.labels.iter().filter(|l| l.n_shapes > 0).count();
         let parts = spec.n_parts.filter(|&n| n > 0);
         rows.push(vec![
             spec.name.clone(),

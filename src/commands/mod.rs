@@ -4,6 +4,7 @@ mod add;
 mod check;
 mod collections;
 mod config;
+mod correct;
 pub(crate) mod demo;
 mod demo_ply;
 pub(crate) mod describe;
@@ -14,15 +15,19 @@ mod json;
 mod labels;
 mod ls;
 mod map;
+mod merge;
 mod name;
 mod nearest;
+mod render;
 mod rm;
 mod serve;
 mod session;
 mod show;
 mod stats;
 mod stop;
+mod suggest;
 pub(crate) mod synth;
+mod undo;
 mod wait;
 mod watch;
 
@@ -126,12 +131,18 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Show(args) => show::run(args, session()?),
         Command::Labels(args) => labels::run(args, session()?),
         Command::Export(args) => export::run(args, session()?),
+        Command::Render(args) => render::run(args, session()?),
         Command::Map(args) => map::run(args, session()?),
         Command::Nearest(args) => nearest::run(args, session()?),
         Command::Rm(args) => rm::run(args, session()?),
         Command::Watch(args) => watch::run(args, session()?),
         Command::Events(args) => events::run(args, session()?),
         Command::Name(args) => name::run(args, session()?),
+        Command::Suggest(args) => suggest::run(args, session()?),
+        Command::Correct(args) => correct::run(args, session()?),
+        Command::Merge(args) => merge::merge(args, session()?),
+        Command::Split(args) => merge::split(args, session()?),
+        Command::Undo(args) => undo::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
         Command::Synth(args) => synth::run(args, cli.global.json)
             .map(|()| true)

@@ -58,7 +58,10 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
             l.id.to_string(),
             l.name.clone(),
             json::colour(l.colour_rgb),
-            state.unwrap_or_else(|| "in use".to_owned()),
+            state.unwrap_or_else(|| match l.n_shapes {
+                0 => "out of use".to_owned(),
+                n => format!("on {n} shapes"),
+            }),
         ]);
     }
     session.line(&table(&rows))?;

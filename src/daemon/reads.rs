@@ -106,10 +106,18 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
                 .map_err(refuse)?;
             Reply::Nearest(convert::nearest(nearest))
         }
+        Body::SuggestNext(r) => {
+            let suggestion = library.suggest(&r.collection).map_err(refuse)?;
+            Reply::SuggestNext(convert::suggested(&suggestion))
+        }
         Body::EventsSince(r) => Reply::EventsSince(events_since(daemon, &r)?),
         Body::CreateCollection(_)
         | Body::DeleteCollection(_)
         | Body::NameLabel(_)
+        | Body::CorrectLabels(_)
+        | Body::MergeLabels(_)
+        | Body::SplitLabel(_)
+        | Body::Undo(_)
         | Body::AddShapes(_)
         | Body::CancelJob(_)
         | Body::RemoveShape(_)

@@ -57,6 +57,10 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             Body::CreateCollection(_)
             | Body::DeleteCollection(_)
             | Body::NameLabel(_)
+            | Body::CorrectLabels(_)
+            | Body::MergeLabels(_)
+            | Body::SplitLabel(_)
+            | Body::Undo(_)
             | Body::AddShapes(_)
             | Body::CancelJob(_)
             | Body::RemoveShape(_)
@@ -86,6 +90,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetFunctionalMap(_)
             | Body::GetPartCorrespondence(_)
             | Body::Nearest(_)
+            | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let readers = Arc::clone(&readers);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {

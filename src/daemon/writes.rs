@@ -86,6 +86,35 @@ pub(crate) fn change(
                 label: Some(convert::label_info(&label)),
             })
         }
+        Body::CorrectLabels(r) => {
+            let correction = convert::correction(r, FrameReader::new(frames))?;
+            let done = library
+                .correct(&r.collection, &r.shape, &correction, key)
+                .map_err(refuse)?;
+            daemon.labels_changed(&r.collection);
+            Reply::CorrectLabels(convert::corrected(&done))
+        }
+        Body::MergeLabels(r) => {
+            let (label, n_shapes) = library
+                .merge_labels(&r.collection, r.label, r.into, key)
+                .map_err(refuse)?;
+            daemon.labels_changed(&r.collection);
+            let label = Some(convert::label_info(&label));
+            Reply::MergeLabels(wire::MergeLabelsReply { label, n_shapes })
+        }
+        Body::SplitLabel(r) => {
+            let (label, n_shapes) = library
+                .split_label(&r.collection, r.label, key)
+                .map_err(refuse)?;
+            daemon.labels_changed(&r.collection);
+            let label = Some(convert::label_info(&label));
+            Reply::SplitLabel(wire::SplitLabelReply { label, n_shapes })
+        }
+        Body::Undo(r) => {
+            let undone = library.undo(&r.collection, key).map_err(refuse)?;
+            daemon.labels_changed(&r.collection);
+            Reply::Undo(convert::undone(&undone))
+        }
         Body::RemoveShape(r) => {
             library
                 .remove(&r.collection, &r.shape, key)
@@ -106,6 +135,14 @@ pub(crate) fn change(
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
     };
     Ok(Done::Now(Box::new(reply)))
+}
+
+impl Daemon {
+    /// A person changed labels: what happened is published, and what follows begins.
+    fn labels_changed(self: &Arc<Self>, collection: &str) {
+        self.notice(Notice::Changed(collection.to_owned()));
+        self.nudge(collection);
+    }
 }
 
 fn refuse(e: LibraryError) -> wire::Error {

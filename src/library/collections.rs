@@ -1,13 +1,15 @@
 //! Collections: created, described, deleted; their labels named.
 
 use super::commit::event;
+use super::history::Before;
 use super::rows::{damaged, operator_from_name, operator_name, to_json};
 use super::{
     CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
     RequestKey, Result, Up,
 };
 use crate::pipeline::Params;
-use crate::store::{CollectionRow, Digest, NewCollection, Reader};
+use crate::store::catalog::KIND_NAME;
+use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader};
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -116,6 +118,18 @@ impl Library {
         self.with_lane(row, |lane| {
             self.once(key, request, |tx| {
                 let mut known = find_label(tx, lane.row.id, label)?;
+                let labels = tx.labels(lane.row.id)?;
+                let taken = |l: &&LabelRow| {
+                    l.id != label && l.merged_into.is_none() && l.name.as_deref() == Some(name)
+                };
+                if let Some(other) = labels.iter().find(taken) {
+                    return Err(LibraryError::AlreadyExists {
+                        reason: "NAME_TAKEN",
+                        message: format!("label {} is named {name:?} already", other.id),
+                    });
+                }
+                let before = Before::names(labels);
+                tx.insert_correction(lane.row.id, KIND_NAME, "{}", &before.encode())?;
                 known.name = Some(name.to_string());
                 tx.put_label(lane.row.id, &known)?;
                 event(
@@ -130,13 +144,21 @@ impl Library {
             })
         })?;
         let row = self.collection_row(collection)?;
-        self.store
-            .catalog()
-            .read(|r| find_label(r, row.id, label).map(label_info))
+        self.label_of(&row, label)
+    }
+
+    /// A label as it stands.
+    pub(super) fn label_of(&self, row: &CollectionRow, label: LabelId) -> Result<LabelInfo> {
+        self.store.catalog().read(|r| {
+            let uses = r.label_uses(row.id)?;
+            let n_shapes = uses.get(&label).copied().unwrap_or(0);
+            Ok(label_info(find_label(r, row.id, label)?, n_shapes))
+        })
     }
 }
 
-fn find_label(
+/// A label of a collection, in use or not.
+pub(super) fn find_label(
     reader: &Reader<'_>,
     collection: crate::store::CollectionId,
     label: LabelId,
@@ -151,22 +173,31 @@ fn find_label(
     })
 }
 
-fn label_info(row: crate::store::LabelRow) -> LabelInfo {
+/// A label with the number of shapes that carry it.
+pub(super) fn label_info(row: crate::store::LabelRow, n_shapes: u64) -> LabelInfo {
     LabelInfo {
         id: row.id,
         name: row.name,
         colour: row.colour,
         merged_into: row.merged_into,
+        n_shapes,
     }
 }
 
 fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
     let place = format!("collections {}", row.name);
+    let uses = reader.label_uses(row.id)?;
+    let labels = reader.labels(row.id)?.into_iter();
     Ok(CollectionInfo {
         sequence: row.sequence,
         n_shapes: reader.n_shapes(row.id)?,
         n_stale: reader.n_stale(row.id)?,
-        labels: reader.labels(row.id)?.into_iter().map(label_info).collect(),
+        labels: labels
+            .map(|l| {
+                let n_shapes = uses.get(&l.id).copied().unwrap_or(0);
+                label_info(l, n_shapes)
+            })
+            .collect(),
         spec: CollectionSpec {
             n_parts: row.n_parts,
             up: row.up.parse::<Up>().map_err(|e| damaged(&place, &e))?,

@@ -26,9 +26,6 @@ pub(super) struct Commit<'a> {
     pub(super) plan: Plan,
 }
 
-/// Why a stored shape's labels change.
-const RECLUSTERING: &str = "reclustering";
-
 impl Library {
     /// Writes an addition and brings the lane up to it.
     pub(super) fn commit(
@@ -87,6 +84,9 @@ impl Library {
             if accepted {
                 tx.mark_stale_before(collection, epoch)?;
             }
+            if commit.plan.teach_again {
+                tx.mark_all_stale(collection)?;
+            }
             tx.set_model(collection, &blob)?;
             tx.set_epoch(collection, epoch)?;
             tx.set_state(collection, to_json(&commit.plan.state).as_bytes())?;
@@ -101,8 +101,14 @@ impl Library {
                 shape.stale = !commit.plan.state.representatives.contains(&shape.ordinal);
             }
         }
+        if commit.plan.teach_again {
+            lane.shapes.iter_mut().for_each(|s| s.stale = true);
+        }
         lane.shapes
             .push(KnownShape::fresh(id, commit.shape.ordinal, signature));
+        if let (true, Some(new)) = (commit.plan.teach_again, lane.shapes.last_mut()) {
+            new.stale = true;
+        }
         lane.row = row;
         lane.learnt = Some(commit.plan.learnt);
         lane.state = commit.plan.state;
@@ -138,13 +144,16 @@ pub(super) fn event(tx: &Tx<'_>, collection: CollectionId, kind: &EventKind) -> 
         EventKind::LabelMerged { .. } => "label_merged",
         EventKind::LabelSplit { .. } => "label_split",
         EventKind::LabelNamed { .. } => "label_named",
+        EventKind::LabelRetired { .. } => "label_retired",
+        EventKind::Corrected { .. } => "corrected",
+        EventKind::Undone { .. } => "undone",
         EventKind::Reclustered { .. } => "reclustered",
     };
     Ok(tx.append_event(collection, name, &to_json(kind))?)
 }
 
 /// Writes new labels of a stored shape and says which faces changed.
-fn put_relabelled(
+pub(super) fn put_relabelled(
     tx: &Tx<'_>,
     collection: CollectionId,
     relabelled: &mut Relabelled,
@@ -156,11 +165,11 @@ fn put_relabelled(
     let changed = EventKind::LabelsChanged {
         shape: relabelled.name.clone(),
         version: labels.row.version,
-        cause: RECLUSTERING.into(),
+        cause: relabelled.cause.into(),
         moves: relabelled.moves.clone(),
     };
     labels.row.sequence = event(tx, collection, &changed)?;
-    labels.row.cause = RECLUSTERING.into();
+    labels.row.cause = relabelled.cause.into();
     labels.row.sources_json = to_json(&sources);
     Ok(tx.put_labels(relabelled.shape, &labels.row, &labels.summary)?)
 }
@@ -209,12 +218,12 @@ fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> 
 }
 
 /// The row of a collection that is known to be there.
-fn collection_row(tx: &Tx<'_>, id: CollectionId) -> Result<CollectionRow> {
+pub(super) fn collection_row(tx: &Tx<'_>, id: CollectionId) -> Result<CollectionRow> {
     tx.collection_by_id(id)?
         .ok_or_else(|| super::rows::damaged("collections", &format!("row {id} is gone")))
 }
 
-fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow {
+pub(super) fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow {
     MapRow {
         from,
         to,

@@ -1,6 +1,6 @@
 //! Why an operation on the library failed.
 
-use super::Failure;
+use super::{Failure, FailureSubject};
 use crate::store::StoreError;
 
 /// Why an operation on the library failed.
@@ -12,6 +12,13 @@ pub enum LibraryError {
     InvalidArgument {
         reason: &'static str,
         message: String,
+    },
+    /// The same, of one place in the input.
+    #[error("{message}")]
+    InvalidFace {
+        reason: &'static str,
+        message: String,
+        subject: FailureSubject,
     },
     #[error("no {what} named {name:?}")]
     NotFound { what: &'static str, name: String },

@@ -12,6 +12,8 @@ pub(super) struct KnownShape {
     pub(super) id: ShapeId,
     pub(super) ordinal: u64,
     pub(super) stale: bool,
+    /// Whether a person labelled faces of it.
+    pub(super) pinned: bool,
     pub(super) signature: Vec<f32>,
 }
 
@@ -44,6 +46,7 @@ impl Lane {
         reader.each_signature(row.id, |id, signature| {
             signatures.insert(id, signature.to_vec());
         })?;
+        let pinned = reader.pinned_shapes(row.id)?;
         let mut shapes = Vec::new();
         for s in reader.shapes(row.id, 0, usize::MAX, None)? {
             let signature = signatures.remove(&s.id);
@@ -53,6 +56,7 @@ impl Lane {
                 id: s.id,
                 ordinal: s.ordinal,
                 stale: s.stale,
+                pinned: pinned.binary_search(&s.id).is_ok(),
                 signature,
             });
         }
@@ -71,8 +75,10 @@ impl Lane {
 
     /// Whether a shape's labels are part of the model of this epoch.
     pub(super) fn informs(&self, shape: &KnownShape) -> bool {
-        shape.ordinal > self.state.epoch_ordinal
-            || self.state.representatives.contains(&shape.ordinal)
+        let is_newer = shape.ordinal > self.state.epoch_ordinal;
+        let counts = is_newer && !self.state.silent.contains(&shape.ordinal)
+            || self.state.representatives.contains(&shape.ordinal);
+        counts && self.state.teaching.is_none()
     }
 
     /// Indices of the shapes nearest to a signature, nearest first.
@@ -82,15 +88,25 @@ impl Lane {
         n_descriptors: usize,
         limit: usize,
     ) -> Vec<(usize, f64)> {
+        let all: Vec<usize> = (0..self.shapes.len()).collect();
+        self.nearest_among(&all, signature, n_descriptors, limit)
+    }
+
+    /// Those of the shapes `among` that are nearest to a signature, nearest first.
+    pub(super) fn nearest_among(
+        &self,
+        among: &[usize],
+        signature: &[f32],
+        n_descriptors: usize,
+        limit: usize,
+    ) -> Vec<(usize, f64)> {
         let Some(learnt) = &self.learnt else {
             return Vec::new();
         };
         let metric = SignatureMetric::new(&learnt.model.normalisation, n_descriptors);
-        metric.nearest(
-            signature,
-            self.shapes.iter().map(|s| s.signature.as_slice()),
-            limit,
-        )
+        let signatures = among.iter().map(|at| self.shapes[*at].signature.as_slice());
+        let found = metric.nearest(signature, signatures, limit).into_iter();
+        found.map(|(i, distance)| (among[i], distance)).collect()
     }
 
     /// Shapes to be clustered together, at most `limit`, spread evenly over the order of arrival.

@@ -28,21 +28,30 @@
 //! # }
 //! ```
 
+mod carry;
 mod collections;
 mod commit;
+mod correct;
 mod error;
+mod history;
 mod lane;
 mod learnt;
+mod merge;
 mod place;
 mod read;
 mod relabel;
 mod rows;
 mod submit;
+mod suggest;
+mod teach;
 mod types;
 
+pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
+pub use history::Undone;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES};
 pub use rows::report_to_json;
+pub use suggest::Suggestion;
 pub use types::{
     CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,
     JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,

@@ -44,6 +44,8 @@ pub(super) struct Plan {
     pub(super) changes: Vec<LabelChange>,
     /// Scores before and after, and whether the new labels were taken.
     pub(super) reclustered: Option<(f64, f64, bool)>,
+    /// Whether what a person said is to be learnt anew, now that the collection has grown.
+    pub(super) teach_again: bool,
 }
 
 impl Library {
@@ -69,12 +71,14 @@ impl Library {
                 .objects()
                 .put_description(digest, &description, &described.params_json)?;
         lap("store");
-        if let Some(old) = replaced {
-            self.forget(lane, old)?;
-        }
+        let was_pinned = match replaced {
+            Some(old) => self.forget(lane, old)?,
+            None => false,
+        };
         let mut n_relabelled = 0;
         let (mut maps, mut sources, mut labelling) = (Vec::new(), Vec::new(), None);
-        if lane.learnt.is_some() {
+        let taught = self.place_taught(lane, &view, was_pinned)?;
+        if lane.learnt.is_some() && taught.is_none() {
             let nearest = lane.nearest(view.signature, view.n_descriptors, MAX_MAPS);
             for &(at, _) in &nearest {
                 n_relabelled += u32::from(self.relabel(lane, at)?);
@@ -92,9 +96,13 @@ impl Library {
         }
         lap("place");
         let due = lane.shapes.len() as u64 + 1 >= lane.state.next_recluster;
-        let plan = match (labelling, &lane.learnt) {
-            (Some(labelling), Some(learnt)) if !due => grown(lane, learnt, labelling, &view),
-            (labelling, _) => self.reclustered(lane, &view, labelling)?,
+        let plan = match (taught, labelling, &lane.learnt) {
+            (Some(taught), ..) => {
+                (maps, sources) = (taught.maps, taught.sources);
+                taught.plan
+            }
+            (None, Some(labelling), Some(learnt)) if !due => grown(lane, learnt, labelling, &view),
+            (None, labelling, _) => self.reclustered(lane, &view, labelling)?,
         };
         lap("recluster");
         n_relabelled += plan.relabelled.len() as u32;
@@ -247,6 +255,7 @@ impl Library {
             next_recluster,
             representatives: ordinals.collect(),
             epoch_ordinal: lane.row.next_ordinal,
+            ..CollectionState::default()
         };
         Ok(Plan {
             learnt: Learnt::begin(outcome.model),
@@ -255,13 +264,14 @@ impl Library {
             relabelled: known.into_iter().zip(labellings).collect(),
             changes: outcome.changes,
             reclustered,
+            teach_again: false,
         })
     }
 
-    /// Takes a shape out of the lane, before it is replaced or removed.
-    pub(super) fn forget(&self, lane: &mut Lane, shape: &ShapeRow) -> Result<()> {
+    /// Takes a shape out of the lane, before it is replaced or removed. Whether a person had labelled faces of it.
+    pub(super) fn forget(&self, lane: &mut Lane, shape: &ShapeRow) -> Result<bool> {
         let Some(at) = lane.shapes.iter().position(|s| s.id == shape.id) else {
-            return Ok(());
+            return Ok(false);
         };
         let informs = lane.informs(&lane.shapes[at]);
         if let Some(learnt) = lane.learnt.as_mut().filter(|_| informs) {
@@ -273,13 +283,12 @@ impl Library {
             let statistics = given.statistics(&prepared, learnt.model.labels.len());
             learnt.model.statistics.accumulate(&statistics, -1.0);
         }
-        lane.shapes.remove(at);
-        Ok(())
+        Ok(lane.shapes.remove(at).pinned)
     }
 }
 
 /// Number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 39, 55, …
-fn next_recluster(n_shapes: u64) -> u64 {
+pub(super) fn next_recluster(n_shapes: u64) -> u64 {
     if n_shapes < TOO_FEW as u64 {
         return n_shapes + 1;
     }
@@ -299,6 +308,7 @@ fn grown(lane: &Lane, learnt: &Learnt, labelling: Labelling, view: &DescriptionV
         relabelled: Vec::new(),
         changes: Vec::new(),
         reclustered: None,
+        teach_again: false,
     }
 }
 
@@ -330,6 +340,7 @@ fn carry(view: &DescriptionView<'_>, learnt: &Learnt, known: &[Known]) -> Carrie
             probabilities: &k.labels.proxy_probabilities,
             p2p: &m.p2p_21,
             residual: m.quality.descriptor_residual,
+            trust: 1.0,
         })
         .collect();
     let labelling = label(view, &prepared, model, &votes);
@@ -368,6 +379,7 @@ impl KnownShape {
             id,
             ordinal,
             stale: false,
+            pinned: false,
             signature,
         }
     }

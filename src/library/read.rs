@@ -284,7 +284,22 @@ impl Library {
                 }
             }
             let (_, gone) = self.shape_row(collection, shape)?;
-            self.forget(lane, &gone)?;
+            let before = self.vocabulary(lane, None)?;
+            let was_pinned = self.forget(lane, &gone)?;
+            let after = self.vocabulary(lane, None)?;
+            let again = match &lane.state.teaching {
+                Some(teaching) if was_pinned => self.relearnt(lane, teaching)?,
+                _ => None,
+            };
+            let retired = before.labels.difference(&after.labels);
+            let retired: Vec<LabelId> = retired
+                .copied()
+                .filter(|_| again.as_ref().is_some_and(|t| t.closed))
+                .collect();
+            let teach_again = again.is_some();
+            if teach_again {
+                lane.state.teaching = again;
+            }
             let blob = lane.learnt.as_ref().map(super::learnt::Learnt::encode);
             let id = lane.row.id;
             self.once(key, request, |tx| {
@@ -296,12 +311,21 @@ impl Library {
                         shape: shape.into(),
                     },
                 )?;
+                for label in &retired {
+                    super::commit::event(tx, id, &EventKind::LabelRetired { label: *label })?;
+                }
+                if teach_again {
+                    tx.mark_all_stale(id)?;
+                }
                 if let Some(blob) = &blob {
                     tx.set_model(id, blob)?;
                 }
                 tx.set_state(id, to_json(&lane.state).as_bytes())?;
                 Ok(Vec::new())
             })?;
+            if teach_again {
+                self.reload(lane)?;
+            }
             lane.row = self.collection_row(collection)?;
             Ok(())
         })
@@ -331,7 +355,11 @@ impl Library {
         })
     }
 
-    fn shape_row(&self, collection: &str, shape: &str) -> Result<(CollectionRow, ShapeRow)> {
+    pub(super) fn shape_row(
+        &self,
+        collection: &str,
+        shape: &str,
+    ) -> Result<(CollectionRow, ShapeRow)> {
         self.store.catalog().read(|r| {
             let row = require_collection(r, collection)?;
             let found = r.shape_by_name(row.id, shape)?;

@@ -24,6 +24,18 @@ pub(super) struct Relabelled {
     pub(super) name: String,
     pub(super) labels: NewLabels,
     pub(super) moves: Vec<LabelMove>,
+    /// The rule that allows it.
+    pub(super) cause: &'static str,
+}
+
+/// Causes of new labels of stored shapes.
+pub(super) mod cause {
+    pub(crate) const RECLUSTERING: &str = "reclustering";
+    pub(crate) const CORRECTION: &str = "correction";
+    pub(crate) const CARRYING: &str = "carrying";
+    pub(crate) const MERGE: &str = "merge";
+    pub(crate) const SPLIT: &str = "split";
+    pub(crate) const UNDO: &str = "undo";
 }
 
 /// Where the bytes of a shape come from, and their format.
@@ -51,7 +63,9 @@ impl Library {
             let c = labelling.probabilities[view.face_map[p] as usize * k + *class as usize];
             confidence.push(c);
         }
-        let pieces = parts(&surface, &labelling.classes);
+        // Two classes may be one label, after labels were merged.
+        let ids_of_face: Vec<u32> = labelling.classes.iter().map(|c| ids[*c as usize]).collect();
+        let pieces = parts(&surface, &ids_of_face);
         let mut confident_area = vec![0.0; pieces.label.len()];
         for (f, part) in pieces.part_of_face.iter().enumerate() {
             confident_area[*part as usize] +=
@@ -59,7 +73,7 @@ impl Library {
         }
         let infos: Vec<PartInfo> = (0..pieces.label.len())
             .map(|p| PartInfo {
-                label: ids[pieces.label[p] as usize],
+                label: pieces.label[p],
                 area_share: pieces.area[p],
                 confidence: confident_area[p] / pieces.area[p].max(1e-300),
             })
@@ -112,6 +126,7 @@ impl Library {
             name: known.row.name.clone(),
             labels,
             moves,
+            cause: cause::RECLUSTERING,
         })
     }
 
@@ -119,6 +134,9 @@ impl Library {
     /// stale. The result depends on neither the time nor the order in which stale shapes are labelled, because only
     /// representatives, which are never stale, vote.
     pub(super) fn relabel(&self, lane: &mut Lane, at: usize) -> Result<bool> {
+        if lane.state.teaching.is_some() {
+            return self.relabel_taught(lane, at);
+        }
         let shape = &lane.shapes[at];
         let Some(learnt) = lane.learnt.as_ref().filter(|_| shape.stale) else {
             return Ok(false);
@@ -151,6 +169,7 @@ impl Library {
                 probabilities: &k.labels.proxy_probabilities,
                 p2p,
                 residual: *residual,
+                trust: 1.0,
             })
             .collect();
         let prepared = Prepared::new(&view, &model);
@@ -241,7 +260,7 @@ fn mean_edge(mesh: &mesh::TriMesh) -> f64 {
 }
 
 /// Area that moves from label to label, largest first; empty if nothing changes.
-fn moves(before: &[i32], after: &[i32], area: &[f32]) -> Vec<LabelMove> {
+pub(super) fn moves(before: &[i32], after: &[i32], area: &[f32]) -> Vec<LabelMove> {
     let mut moved = BTreeMap::<(i32, i32), f64>::new();
     for ((b, a), w) in before.iter().zip(after).zip(area) {
         if a != b {

@@ -17,6 +17,29 @@ pub(super) struct CollectionState {
     pub(super) representatives: Vec<u64>,
     /// Newest ordinal when the epoch began.
     pub(super) epoch_ordinal: u64,
+    /// Ordinals of shapes that came after that and yet inform the model not: an undone correction labelled them.
+    #[serde(default)]
+    pub(super) silent: Vec<u64>,
+    /// From the first correction on: what labels are carried from, in the place of discovery.
+    #[serde(default)]
+    pub(super) teaching: Option<Teaching>,
+}
+
+/// How the labels of a collection follow from what a person said.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Teaching {
+    /// What a person said has not been learnt yet.
+    pub(super) pending: bool,
+    /// Descriptors are standardised over the representatives that learn.
+    pub(super) normalised: bool,
+    /// Only labels that a person used are given; otherwise discovered ones count as well.
+    pub(super) closed: bool,
+    /// Ordinals of the representatives that learnt; their labels vote.
+    pub(super) taught: Vec<u64>,
+    /// Ordinals of the representatives whose discovered labels count, and the versions in which they had them.
+    pub(super) discovered: Vec<(u64, u64)>,
+    /// Label of each class in the probabilities of those versions.
+    pub(super) discovered_labels: Vec<u32>,
 }
 
 pub(super) fn to_json<T: Serialize>(value: &T) -> String {

@@ -422,7 +422,9 @@ fn taken(item: &JobItem) -> Failure {
 /// An error of the library as the failure of an item.
 fn failure(error: &LibraryError) -> Failure {
     let (code, reason) = match error {
-        LibraryError::InvalidArgument { reason, .. } => ("INVALID_ARGUMENT", *reason),
+        LibraryError::InvalidArgument { reason, .. } | LibraryError::InvalidFace { reason, .. } => {
+            ("INVALID_ARGUMENT", *reason)
+        }
         LibraryError::NotFound { .. } => ("NOT_FOUND", "GONE"),
         LibraryError::AlreadyExists { reason, .. } => ("ALREADY_EXISTS", *reason),
         LibraryError::FailedPrecondition { reason, .. } => ("FAILED_PRECONDITION", *reason),

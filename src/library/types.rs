@@ -110,6 +110,8 @@ pub struct LabelInfo {
     pub colour: [u8; 3],
     /// The label this one was merged into; `None` while it is in use.
     pub merged_into: Option<LabelId>,
+    /// Shapes that carry it.
+    pub n_shapes: u64,
 }
 
 /// A shape to be added.
@@ -323,7 +325,7 @@ pub enum EventKind {
         shape: String,
         /// The new version.
         version: u64,
-        /// The rule that allowed it: `reclustering`, `correction`, ...
+        /// The rule that allowed it: `reclustering`, `correction`, `carrying`, `merge`, `split`, `undo`.
         cause: String,
         /// Share of the shape's area that moved, from label to label (-1: unlabelled).
         moves: Vec<LabelMove>,
@@ -353,6 +355,27 @@ pub enum EventKind {
         label: LabelId,
         /// The name.
         name: String,
+    },
+    /// A label went out of use: no shape that a person labelled has it.
+    LabelRetired {
+        /// Its id.
+        label: LabelId,
+    },
+    /// A person labelled faces of a shape; they never change again by themselves.
+    Corrected {
+        /// The shape.
+        shape: String,
+        /// Version of its labels.
+        version: u64,
+        /// Its faces that a person labelled, now or before.
+        n_faces: u64,
+        /// Share of its area that those cover.
+        area_share: f64,
+    },
+    /// The newest change by a person was undone.
+    Undone {
+        /// What it was: `correct`, `name`, `merge` or `split`.
+        change: String,
     },
     /// The parts of the collection were clustered anew.
     Reclustered {

@@ -1,14 +1,18 @@
 //! START HERE. Bytes become a [`Description`]; a description and a library snapshot become a [`Labelling`].
 
 mod describe;
+mod exemplars;
 mod place;
 mod recluster;
+mod split;
 
 pub use crate::description::{Description, DescriptionView, Params};
 pub use describe::{
     ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of,
 };
+pub use exemplars::{Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach};
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
     LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, recluster,
 };
+pub use split::{split_faces, split_model};

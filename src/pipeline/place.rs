@@ -8,7 +8,7 @@ use crate::labels::{Features, LabelModel, Statistics};
 use crate::segmentation::Surface;
 
 /// Probabilities below this count as this: one source must not veto what all others say.
-const FLOOR: f64 = 0.02;
+pub(super) const FLOOR: f64 = 0.02;
 /// Share of the carried vote, the rest being the label model's, in the log-linear mean.
 const VOTE_SHARE: f64 = 0.5;
 /// Boundary strength of the cut.
@@ -73,6 +73,8 @@ pub struct Vote<'a> {
     pub p2p: &'a [u32],
     /// Descriptor residual of the map.
     pub residual: f64,
+    /// How much its labels are believed: 1 if they were carried, more if a person gave them.
+    pub trust: f64,
 }
 
 /// Labels of one shape, as classes of the label model.
@@ -88,7 +90,7 @@ pub struct Labelling {
 
 impl Labelling {
     /// The labelling that `classes` and the evidence `posterior (m, k)` make.
-    fn new(classes: Vec<u32>, posterior: &[f64], weights: Vec<f64>, k: usize) -> Self {
+    pub(super) fn new(classes: Vec<u32>, posterior: &[f64], weights: Vec<f64>, k: usize) -> Self {
         let probabilities = posterior
             .iter()
             .enumerate()
@@ -153,13 +155,17 @@ pub fn label(
 }
 
 /// Label probabilities of each face `(m, k)` by the votes, and the weight of each vote.
-fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f64>, Vec<f64>) {
+pub(super) fn carried(
+    shape: &DescriptionView<'_>,
+    votes: &[Vote<'_>],
+    k: usize,
+) -> (Vec<f64>, Vec<f64>) {
     let Some(least) = votes.iter().map(|v| v.residual).min_by(f64::total_cmp) else {
         return (Vec::new(), Vec::new());
     };
     let mut weights: Vec<f64> = votes
         .iter()
-        .map(|v| (-(v.residual - least) / (RESIDUAL_SCALE * least + 1e-9)).exp())
+        .map(|v| v.trust * (-(v.residual - least) / (RESIDUAL_SCALE * least + 1e-9)).exp())
         .collect();
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum);

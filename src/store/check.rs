@@ -3,6 +3,7 @@
 //! Reads only, and may run beside the daemon: the catalog is seen as of one moment, and a file that
 //! is missing counts only if the row that names it is still there afterwards.
 
+use super::catalog::KEPT_LABEL_VERSIONS;
 use super::catalog::schema::TABLES;
 use super::catalog::{self, Reader};
 use super::disk::{Disk, RealDisk};
@@ -293,7 +294,10 @@ fn check_labels(
         );
         findings.damage(&place, message);
     }
-    if versions.windows(2).any(|pair| pair[1] != pair[0] + 1) {
+    // Before the newest ones, versions are kept that a correction needs to be undone.
+    let first = shape.version.saturating_sub(KEPT_LABEL_VERSIONS - 1);
+    let is_gap = |pair: &[u64]| pair[1] != pair[0] + 1 && pair[1] > first;
+    if versions.windows(2).any(is_gap) {
         findings.damage(
             &place,
             format!("versions of its labels are missing among {versions:?}"),

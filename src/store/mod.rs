@@ -40,9 +40,9 @@ pub use health::Health;
 pub use mapped::MappedDescription;
 pub use objects::Objects;
 pub use rows::{
-    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary, LabelVersionRow,
-    MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind, ObjectRow, RequestRow, ShapeId,
-    ShapeRow,
+    CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
+    LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
+    ObjectRow, RequestRow, ShapeId, ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

@@ -218,6 +218,30 @@ pub struct LabelRow {
     pub merged_into: Option<u32>,
 }
 
+/// Something a person changed in a collection, as long as it can be undone.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CorrectionRow {
+    /// Its id, growing in the order of the changes.
+    pub id: i64,
+    /// What kind of change, as the library writes it.
+    pub kind: String,
+    /// What was changed, as the library writes it.
+    pub detail_json: String,
+    /// What the library needs to undo it.
+    pub before: Vec<u8>,
+}
+
+/// The newest labels a shape had before a correction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelsBefore {
+    /// Which shape.
+    pub shape: ShapeId,
+    /// Version of its labels then; it stays readable as long as the correction can be undone.
+    pub version: u64,
+    /// What its row said of them.
+    pub summary: LabelSummary,
+}
+
 /// A functional map that is kept.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapRow {

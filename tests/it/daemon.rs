@@ -1,6 +1,7 @@
 //! The daemon over its real sockets.
 
 mod adding;
+mod correcting;
 mod life;
 
 use crate::harness::{DEADLINE, Home, add, add_request, refusal, skittle};

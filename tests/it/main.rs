@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod cli;
+mod correcting;
 mod daemon;
 mod harness;
 mod pipeline;

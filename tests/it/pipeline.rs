@@ -13,15 +13,15 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use tempfile::TempDir;
 
-const COLLECTION: &str = "shapes";
+pub(crate) const COLLECTION: &str = "shapes";
 
 /// Few faces, so that a stream takes seconds.
-const SMALL: Options = Options {
+pub(crate) const SMALL: Options = Options {
     n_faces: 1_500,
     rotate: false,
 };
 
-fn library(n_parts: u32, up: Up) -> (TempDir, Library) {
+pub(crate) fn library(n_parts: u32, up: Up) -> (TempDir, Library) {
     let folder = tempfile::tempdir().unwrap();
     let library = Library::open(folder.path()).unwrap();
     let spec = CollectionSpec {
@@ -34,7 +34,7 @@ fn library(n_parts: u32, up: Up) -> (TempDir, Library) {
     (folder, library)
 }
 
-fn file(name: &str, mesh: &TriMesh) -> NewShape {
+pub(crate) fn file(name: &str, mesh: &TriMesh) -> NewShape {
     NewShape {
         name: name.into(),
         bytes: off(mesh).into_bytes(),
@@ -43,7 +43,7 @@ fn file(name: &str, mesh: &TriMesh) -> NewShape {
     }
 }
 
-fn stream(library: &Library, shapes: &[Labelled]) {
+pub(crate) fn stream(library: &Library, shapes: &[Labelled]) {
     for s in shapes {
         let placed = library.add(COLLECTION, file(&s.name, &s.mesh)).unwrap();
         assert_eq!(placed.outcome, Outcome::Added);
@@ -58,7 +58,7 @@ fn stream(library: &Library, shapes: &[Labelled]) {
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
 }
 
-fn all_labels(library: &Library) -> BTreeMap<String, Vec<i32>> {
+pub(crate) fn all_labels(library: &Library) -> BTreeMap<String, Vec<i32>> {
     let (_, snapshot) = library.labels_snapshot(COLLECTION).unwrap();
     snapshot
         .into_iter()

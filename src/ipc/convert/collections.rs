@@ -140,6 +140,7 @@ pub fn label_info(label: &LabelInfo) -> wire::LabelInfo {
         name: label.name.clone().unwrap_or_default(),
         colour_rgb: r << 16 | g << 8 | b,
         merged_into: label.merged_into,
+        n_shapes: label.n_shapes,
     }
 }
 

@@ -53,6 +53,14 @@ pub fn library_error(e: &LibraryError) -> Error {
         LibraryError::InvalidArgument { reason: name, .. } => {
             error(ErrorCode::InvalidArgument, reason(name), message)
         }
+        LibraryError::InvalidFace {
+            reason: name,
+            subject: place,
+            ..
+        } => with_subject(
+            error(ErrorCode::InvalidArgument, reason(name), message),
+            subject(*place),
+        ),
         LibraryError::NotFound { what, .. } => {
             let reason = match *what {
                 "collection" => ErrorReason::NoCollection,
@@ -99,12 +107,18 @@ pub fn failure(f: &Failure) -> Error {
         reason(&f.reason),
         f.message.clone(),
     );
-    let subject = f.subject.map(|subject| match subject {
+    Error {
+        subject: f.subject.map(subject),
+        ..error
+    }
+}
+
+fn subject(place: FailureSubject) -> Subject {
+    match place {
         FailureSubject::Face(i) => Subject::Face(i),
         FailureSubject::Vertex(i) => Subject::Vertex(i),
         FailureSubject::Line(i) => Subject::Line(i),
-    });
-    Error { subject, ..error }
+    }
 }
 
 /// The failure of a shape whose placing the library refused.

@@ -62,6 +62,23 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
             label: *label,
             name: name.clone(),
         }),
+        EventKind::LabelRetired { label } => {
+            Kind::LabelRetired(wire::LabelRetired { label: *label })
+        }
+        EventKind::Corrected {
+            shape,
+            version,
+            n_faces,
+            area_share,
+        } => Kind::Corrected(wire::Corrected {
+            shape: shape.clone(),
+            version: *version,
+            n_faces: *n_faces,
+            area_share: *area_share,
+        }),
+        EventKind::Undone { change } => Kind::Undone(wire::Undone {
+            change: change.clone(),
+        }),
         EventKind::Reclustered {
             score_before,
             score_after,

@@ -2,6 +2,7 @@
 
 mod analysis;
 mod collections;
+mod corrections;
 mod errors;
 mod events;
 mod jobs;
@@ -9,6 +10,7 @@ mod shapes;
 
 pub use analysis::{descriptors, functional_map, hks, nearest, part_correspondence, spectrum};
 pub use collections::{collection, collection_differs, collection_spec, label_info};
+pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{
     error, failure, field_error, frame_error, library_error, library_failure, with_subject,
 };

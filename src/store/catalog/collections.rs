@@ -161,6 +161,12 @@ impl Tx<'_> {
         self.returned(id, taken, params![id, count])
     }
 
+    /// Sees to it that new labels have ids above `label`, which a person has chosen.
+    pub fn reserve_label(&self, id: CollectionId, label: u32) -> Result<()> {
+        let sql = "UPDATE collections SET next_label = max(next_label, ?2) WHERE id = ?1";
+        self.change(&COLLECTIONS, id, sql, params![id, u64::from(label) + 1])
+    }
+
     fn returned<T: rusqlite::types::FromSql>(
         &self,
         id: CollectionId,

@@ -6,6 +6,7 @@ use crate::store::StoreError;
 use crate::store::codec::{pack_bytes, pack_labels, unpack_bytes, unpack_labels};
 use crate::store::rows::{CollectionId, LabelRow, LabelSummary, LabelVersionRow, ShapeId};
 use rusqlite::params;
+use std::collections::BTreeMap;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
@@ -84,6 +85,15 @@ impl Reader<'_> {
         )
     }
 
+    /// For each label the number of shapes of a collection whose newest labels carry it.
+    pub fn label_uses(&self, collection: CollectionId) -> Result<BTreeMap<u32, u64>> {
+        let sql = "SELECT label, count(*) FROM shape_labels JOIN shapes ON shapes.id = shape_id
+                   WHERE collection_id = ?1 GROUP BY label";
+        let mut statement = self.connection().prepare_cached(sql)?;
+        let uses = statement.query_map([collection], |row| Ok((row.get(0)?, row.get(1)?)))?;
+        Ok(uses.collect::<rusqlite::Result<_>>()?)
+    }
+
     /// The statistics of a shape and the epoch they are of.
     pub fn stats(&self, shape: ShapeId) -> Result<Option<(u64, Vec<u8>)>> {
         self.first(&SHAPE_STATS, "WHERE shape_id = ?1", [shape], |fields| {
@@ -123,7 +133,8 @@ impl Tx<'_> {
     }
 
     /// Makes these the newest labels of a shape: stores the version, says so in the shape's row
-    /// (which is then not stale), and forgets versions beyond [`KEPT_LABEL_VERSIONS`].
+    /// (which is then not stale), and forgets versions beyond [`KEPT_LABEL_VERSIONS`] that no
+    /// correction needs to be undone.
     ///
     /// The version must be the shape's plus 1 and the labels as many as the shape has polygons.
     pub fn put_labels(
@@ -157,6 +168,7 @@ impl Tx<'_> {
             (labels.proxy_probabilities.len() % labels.proxy_labels.len().max(1)) as u64,
             0,
         )?;
+        self.keep_for_undo(&row)?;
         self.insert(
             &LABEL_VERSIONS,
             format!("{shape}, {}", labels.version),
@@ -192,7 +204,9 @@ impl Tx<'_> {
         }
         let oldest = (labels.version + 1).saturating_sub(KEPT_LABEL_VERSIONS);
         self.execute(
-            "DELETE FROM label_versions WHERE shape_id = ?1 AND version < ?2",
+            "DELETE FROM label_versions WHERE shape_id = ?1 AND version < ?2 AND NOT EXISTS (
+               SELECT 1 FROM labels_before
+               WHERE labels_before.shape_id = ?1 AND labels_before.version = label_versions.version)",
             params![shape, oldest],
         )?;
         Ok(())

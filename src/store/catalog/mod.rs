@@ -5,6 +5,7 @@
 //! moment they began; with the write-ahead log they never wait for the writer, nor it for them.
 
 mod collections;
+mod corrections;
 mod jobs;
 mod labels;
 pub(in crate::store) mod log;
@@ -13,6 +14,7 @@ mod reader;
 pub(crate) mod schema;
 mod shapes;
 
+pub use corrections::KIND_NAME;
 pub use labels::KEPT_LABEL_VERSIONS;
 pub use reader::{Reader, Tx};
 pub use schema::CATALOG_FORMAT;

@@ -11,7 +11,10 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are refused.
-pub const CATALOG_FORMAT: u32 = 1;
+pub const CATALOG_FORMAT: u32 = 2;
+
+/// The format before corrections: its tables are there unchanged, [`SINCE_FORMAT_2`] are missing.
+const WITHOUT_CORRECTIONS: u32 = 1;
 
 /// `cseg`, where SQLite files say whose they are.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -146,6 +149,23 @@ tables! {
      polygon_confidence BLOB NOT NULL, sources TEXT NOT NULL, sum INTEGER,
      PRIMARY KEY (shape_id, version)"
 
+    PINS "pins" key 1 ["shape_id", "polygon_labels"]
+    "shape_id INTEGER PRIMARY KEY REFERENCES shapes ON DELETE CASCADE,
+     polygon_labels BLOB NOT NULL, sum INTEGER"
+
+    CORRECTIONS "corrections" key 1 ["id", "collection_id", "kind", "detail", "before"]
+    "id INTEGER PRIMARY KEY AUTOINCREMENT,
+     collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE, kind TEXT NOT NULL,
+     detail TEXT NOT NULL, before BLOB NOT NULL, sum INTEGER"
+
+    LABELS_BEFORE "labels_before" key 2 [
+        "correction_id", "shape_id", "version", "label_epoch", "parts", "area_shares",
+    ]
+    "correction_id INTEGER NOT NULL REFERENCES corrections ON DELETE CASCADE,
+     shape_id INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, version INTEGER NOT NULL,
+     label_epoch INTEGER NOT NULL, parts TEXT NOT NULL, area_shares TEXT NOT NULL, sum INTEGER,
+     PRIMARY KEY (correction_id, shape_id)"
+
     MAPS "maps" key 2 ["from_shape", "to_shape", "k1", "k2", "c_12", "p2p_21", "quality"]
     "from_shape INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE,
      to_shape INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, k1 INTEGER NOT NULL,
@@ -169,6 +189,15 @@ tables! {
      reply BLOB NOT NULL, created INTEGER NOT NULL, sum INTEGER,
      PRIMARY KEY (client_id, request_id)"
 }
+
+/// Tables that format 2 added.
+const SINCE_FORMAT_2: [&Table; 3] = [&PINS, &CORRECTIONS, &LABELS_BEFORE];
+
+/// Indexes of those.
+const INDEXES_SINCE_FORMAT_2: &str = "
+    CREATE INDEX corrections_by_collection ON corrections (collection_id, id);
+    CREATE INDEX labels_before_by_shape ON labels_before (shape_id, version);
+";
 
 const INDEXES: &str = "
     CREATE INDEX stale_shapes ON shapes (collection_id, ordinal) WHERE stale;
@@ -214,6 +243,7 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     let n_tables: i64 =
         connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| row.get(0))?;
     if n_tables > 0 {
+        upgrade(connection)?;
         return check_format(connection, path);
     }
     let tx = connection.transaction()?;
@@ -221,11 +251,36 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
         tx.execute_batch(&table.create())?;
     }
     tx.execute_batch(INDEXES)?;
+    tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
     tx.execute(
         "INSERT INTO meta (key, value) VALUES ('library_id', lower(hex(randomblob(16)))), (?1, ?2)",
         params!["format", CATALOG_FORMAT.to_string()],
     )?;
     tx.pragma_update(None, "application_id", APPLICATION_ID)?;
+    tx.pragma_update(None, "user_version", CATALOG_FORMAT)?;
+    tx.commit()?;
+    Ok(())
+}
+
+/// Brings a catalog of format 1 to format 2, in one transaction; others are left alone.
+fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
+    let pragma = |name: &str| -> rusqlite::Result<u32> {
+        connection.pragma_query_value(None, name, |row| row.get(0))
+    };
+    let is_old = pragma("application_id")? == APPLICATION_ID
+        && pragma("user_version")? == WITHOUT_CORRECTIONS;
+    if !is_old {
+        return Ok(());
+    }
+    let tx = connection.transaction()?;
+    for table in SINCE_FORMAT_2 {
+        tx.execute_batch(&table.create())?;
+    }
+    tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
+    tx.execute(
+        "UPDATE meta SET value = ?1 WHERE key = 'format'",
+        [CATALOG_FORMAT.to_string()],
+    )?;
     tx.pragma_update(None, "user_version", CATALOG_FORMAT)?;
     tx.commit()?;
     Ok(())

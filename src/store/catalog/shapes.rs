@@ -98,6 +98,12 @@ impl Reader<'_> {
         }
     }
 
+    /// Shapes whose labels wait to be recomputed, by ordinal.
+    pub fn stale_shapes(&self, collection: CollectionId) -> Result<Vec<ShapeId>> {
+        let tail = "WHERE stale AND collection_id = ?1 ORDER BY ordinal";
+        self.all(&SHAPES, tail, [collection], |fields| fields.get("id"))
+    }
+
     /// Shapes of a collection.
     pub fn n_shapes(&self, collection: CollectionId) -> Result<u64> {
         self.number(
@@ -252,6 +258,12 @@ impl Tx<'_> {
     pub fn set_stale(&self, id: ShapeId, stale: bool) -> Result<()> {
         let sql = "UPDATE shapes SET stale = ?2 WHERE id = ?1";
         self.change(&SHAPES, id, sql, params![id, stale])
+    }
+
+    /// Marks the labels of every shape of a collection as waiting to be recomputed; how many now are.
+    pub fn mark_all_stale(&self, collection: CollectionId) -> Result<u64> {
+        let sql = "UPDATE shapes SET stale = 1 WHERE collection_id = ?1 AND NOT stale";
+        Ok(self.execute(sql, [collection])? as u64)
     }
 
     /// Marks every shape of a collection whose labels are of an epoch before `epoch`; how many.

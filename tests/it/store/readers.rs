@@ -85,6 +85,40 @@ fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
 }
 
 #[test]
+fn a_catalog_of_format_1_is_brought_to_format_2() -> Result<()> {
+    let (_dir, store) = opened();
+    let library = store.dir().to_path_buf();
+    drop(store);
+    let catalog = library.join("catalog.db");
+    let format = || -> u32 {
+        let connection = rusqlite::Connection::open(&catalog).expect("opens");
+        connection
+            .pragma_query_value(None, "user_version", |row| row.get(0))
+            .expect("a number")
+    };
+    rusqlite::Connection::open(&catalog)
+        .expect("opens")
+        .execute_batch(
+            "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;
+             PRAGMA user_version = 1",
+        )
+        .expect("runs");
+    let store = Store::open(&library)?;
+    assert_eq!(format(), 2);
+    let new = coseg::store::NewCollection {
+        name: "old".into(),
+        ..Default::default()
+    };
+    let left = store.catalog().write(|tx| {
+        let id = tx.insert_collection(&new)?;
+        tx.insert_correction(id, "name", "{}", b"before")?;
+        tx.n_corrections(id)
+    })?;
+    assert_eq!(left, 1);
+    Ok(())
+}
+
+#[test]
 fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
     let (dir, store) = opened();
     let library = store.dir().to_path_buf();
@@ -94,20 +128,20 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 2");
+    change("PRAGMA user_version = 3");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 2,
-                supported: 1,
+                found: 3,
+                supported: 2,
                 ..
             }
         ),
         "{newer}"
     );
-    change("PRAGMA user_version = 1; PRAGMA application_id = 7");
+    change("PRAGMA user_version = 2; PRAGMA application_id = 7");
     assert!(Store::open(&library).err().expect("refused").is_damage());
     let other = dir.path().join("other");
     std::fs::create_dir(&other).expect("created");

@@ -1,0 +1,88 @@
+//! What a person types to correct labels.
+
+use super::InCollection;
+use clap::Args;
+use std::path::PathBuf;
+
+/// `coseg correct`
+#[derive(Debug, Args)]
+pub(crate) struct Correct {
+    /// The shape
+    pub(crate) shape: String,
+    /// An integer a line for each face of the shape's file, in its order: its label; -1 leaves it alone
+    #[arg(value_name = "LABELS", required_unless_present = "part")]
+    pub(crate) labels: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Label one part, numbered from 0 as `coseg show` lists them, instead of reading a file
+    #[arg(long, value_name = "N", requires = "label", conflicts_with = "labels")]
+    pub(crate) part: Option<u32>,
+    /// The label of that part
+    #[arg(long, value_name = "ID", requires = "part")]
+    pub(crate) label: Option<u32>,
+    /// Return when the correction is durable, not when it is carried to the other shapes
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg merge`
+#[derive(Debug, Args)]
+pub(crate) struct Merge {
+    /// The label that goes
+    pub(crate) label: u32,
+    /// The label that stands for both
+    pub(crate) into: u32,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+}
+
+/// `coseg split`
+#[derive(Debug, Args)]
+pub(crate) struct Split {
+    /// The label to split; it keeps the larger share
+    pub(crate) label: u32,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Return when the label is split, not when all shapes are labelled anew
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg undo`
+#[derive(Debug, Args)]
+pub(crate) struct Undo {
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Return when the change is undone, not when shapes that came since are labelled anew
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg suggest`
+#[derive(Debug, Args)]
+pub(crate) struct Suggest {
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg render`
+#[derive(Debug, Args)]
+pub(crate) struct Render {
+    /// The collection; may be left out if there is only one
+    #[arg(value_name = "COLLECTION", conflicts_with = "collection")]
+    pub(crate) name: Option<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// The PNG file to write
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+    /// At most this many shapes, in the order of their arrival
+    #[arg(long, value_name = "N")]
+    pub(crate) max: Option<usize>,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}

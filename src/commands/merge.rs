@@ -1,0 +1,48 @@
+//! `coseg merge` and `coseg split`: two labels become one, one becomes two.
+
+use super::session::Session;
+use super::{Outcome, json};
+use crate::cli::{Merge, Split};
+use coseg::call;
+use coseg::ipc::wire;
+use serde_json::json;
+
+pub(crate) fn merge(args: &Merge, mut session: Session) -> Outcome {
+    let request = wire::MergeLabelsRequest {
+        collection: session.collection(&args.within)?,
+        label: args.label,
+        into: args.into,
+    };
+    let done = call!(session.client, MergeLabels(request))?;
+    if session.json {
+        let label = json::label(&done.label.unwrap_or_default());
+        session.print_json(&json!({ "label": label, "n_shapes": done.n_shapes }))?;
+    } else {
+        let (label, into) = (args.label, args.into);
+        eprintln!("label {label} is {into} now, on {} shapes", done.n_shapes);
+    }
+    Ok(true)
+}
+
+pub(crate) fn split(args: &Split, mut session: Session) -> Outcome {
+    let collection = session.collection(&args.within)?;
+    let request = wire::SplitLabelRequest {
+        collection: collection.clone(),
+        label: args.label,
+    };
+    let done = call!(session.client, SplitLabel(request))?;
+    if !args.no_wait {
+        session.wait_until_idle(&collection)?;
+    }
+    let label = done.label.unwrap_or_default();
+    if session.json {
+        session.print_json(&json::label(&label))?;
+    } else {
+        session.line(&label.id.to_string())?;
+        eprintln!(
+            "label {} is {} and {} now",
+            args.label, args.label, label.id
+        );
+    }
+    Ok(true)
+}

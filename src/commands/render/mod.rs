@@ -1,0 +1,200 @@
+//! `coseg render`: a collection as one picture, each shape in the colours of its labels.
+
+mod canvas;
+mod view;
+
+use super::export::original;
+use super::export_mesh::{colour, material};
+use super::session::{Session, bar};
+use super::{CommandError, Outcome, labels};
+use crate::cli::Render;
+use canvas::{Canvas, GLYPH};
+use coseg::ipc::wire::{self, LabelInfo};
+use coseg::mesh::ParsedMesh;
+use serde_json::json;
+use view::View;
+
+/// Pixels of a shape's square, without its name.
+const CELL: usize = 240;
+/// Pixels around things.
+const MARGIN: usize = 8;
+/// Pixels of a line of text.
+const LINE: usize = GLYPH + 6;
+/// Columns for each row: sheets are wider than high.
+const ASPECT: f64 = 1.5;
+
+pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
+    let collection = match &args.name {
+        Some(name) => name.clone(),
+        None => session.collection(&args.within)?,
+    };
+    if !args.no_wait {
+        session.wait_until_idle(&collection)?;
+    }
+    let about = session.describe(&collection)?;
+    let mut shapes = session.shapes(&collection, None)?;
+    if let Some(max) = args.max {
+        shapes.truncate(max);
+    }
+    let up = about.spec.as_ref().and_then(|s| axis(s.up()));
+    let n_columns = columns(shapes.len());
+    let n_rows = shapes.len().div_ceil(n_columns);
+    let legend = legend(&about.labels);
+    let width = n_columns * (CELL + MARGIN) + MARGIN;
+    let top = MARGIN + LINE * legend_lines(&legend, width);
+    let mut sheet = Canvas::new(width, top + n_rows * (CELL + LINE + MARGIN) + MARGIN);
+    draw_legend(&mut sheet, &legend);
+    let progress = bar(shapes.len() as u64);
+    for (i, shape) in shapes.iter().enumerate() {
+        progress.set_message(shape.name.clone());
+        let request = wire::GetLabelsRequest {
+            collection: collection.clone(),
+            shape: shape.name.clone(),
+            version: 0,
+            confidence: false,
+        };
+        let found = labels::receive(&mut session, request)?.labels;
+        let mesh = original(&mut session, &collection, &shape.name, found.len())?;
+        let colours: Vec<[u8; 3]> = found.iter().map(|&l| colour(l, &about.labels)).collect();
+        let x = MARGIN + i % n_columns * (CELL + MARGIN);
+        let y = top + i / n_columns * (CELL + LINE + MARGIN);
+        sheet.put(x, y, &picture(&mesh, &colours, up));
+        sheet.text(x, y + CELL + 2, &fitting(&shape.name, CELL), [40; 3]);
+        progress.inc(1);
+    }
+    progress.finish_and_clear();
+    let file = |source| CommandError::File {
+        path: args.out.display().to_string(),
+        source,
+    };
+    std::fs::write(&args.out, sheet.png().map_err(file)?).map_err(file)?;
+    if session.json {
+        session.print_json(&json!({
+            "collection": collection,
+            "file": args.out.display().to_string(),
+            "width": sheet.width(),
+            "height": sheet.height(),
+            "n_shapes": shapes.len(),
+        }))?;
+    } else {
+        eprintln!("{} shapes drawn to {}", shapes.len(), args.out.display());
+    }
+    Ok(true)
+}
+
+/// One shape in the colours of its polygons.
+fn picture(mesh: &ParsedMesh, colours: &[[u8; 3]], up: Option<[f64; 3]>) -> Canvas {
+    let view = View::new(&mesh.vertices, up);
+    let corners = mesh
+        .triangles
+        .iter()
+        .map(|t| t.map(|v| mesh.vertices[v as usize]));
+    let painted = corners
+        .zip(&mesh.polygon_of_triangle)
+        .map(|(corners, polygon)| (corners, colours[*polygon as usize]));
+    view.draw(CELL, painted)
+}
+
+fn columns(n_shapes: usize) -> usize {
+    ((n_shapes as f64 * ASPECT).sqrt().ceil() as usize).clamp(1, n_shapes.max(1))
+}
+
+/// Labels in use: text and colour.
+fn legend(labels: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
+    let in_use = labels.iter().filter(|l| l.n_shapes > 0);
+    in_use
+        .filter_map(|l| i32::try_from(l.id).ok())
+        .map(|id| {
+            let name = material(id, labels);
+            let name = name
+                .strip_prefix("label_")
+                .unwrap_or(&name)
+                .replace('_', " ");
+            (name, colour(id, labels))
+        })
+        .collect()
+}
+
+/// Pixels of an entry: a square, its text, a gap.
+fn entry_width(text: &str) -> usize {
+    GLYPH * (text.chars().count() + 4)
+}
+
+/// Where each entry goes: column in pixels, and line.
+fn places(legend: &[(String, [u8; 3])], width: usize) -> Vec<(usize, usize)> {
+    let (mut x, mut line) = (MARGIN, 0);
+    let place = |(text, _): &(String, [u8; 3])| {
+        if x > MARGIN && x + entry_width(text) > width {
+            (x, line) = (MARGIN, line + 1);
+        }
+        let at = (x, line);
+        x += entry_width(text);
+        at
+    };
+    legend.iter().map(place).collect()
+}
+
+fn legend_lines(legend: &[(String, [u8; 3])], width: usize) -> usize {
+    places(legend, width).last().map_or(0, |(_, line)| line + 1)
+}
+
+fn draw_legend(sheet: &mut Canvas, legend: &[(String, [u8; 3])]) {
+    for ((text, colour), (x, line)) in legend.iter().zip(places(legend, sheet.width())) {
+        let y = MARGIN + line * LINE;
+        sheet.fill(x, y, GLYPH * 3 / 2, GLYPH, *colour);
+        sheet.text(x + 2 * GLYPH, y, text, [0; 3]);
+    }
+}
+
+/// As much of a name as fits.
+fn fitting(name: &str, width: usize) -> String {
+    let most = width / GLYPH;
+    if name.chars().count() <= most {
+        return name.to_owned();
+    }
+    let kept: String = name.chars().take(most.saturating_sub(2)).collect();
+    format!("{kept}..")
+}
+
+fn axis(up: wire::Up) -> Option<[f64; 3]> {
+    Some(match up {
+        wire::Up::PlusX => [1.0, 0.0, 0.0],
+        wire::Up::MinusX => [-1.0, 0.0, 0.0],
+        wire::Up::PlusY => [0.0, 1.0, 0.0],
+        wire::Up::MinusY => [0.0, -1.0, 0.0],
+        wire::Up::PlusZ => [0.0, 0.0, 1.0],
+        wire::Up::MinusZ => [0.0, 0.0, -1.0],
+        wire::Up::Unspecified | wire::Up::Unknown | wire::Up::Auto => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{columns, entry_width, fitting, legend_lines, places};
+
+    #[test]
+    fn sheets_are_wider_than_high() {
+        assert_eq!(
+            (columns(0), columns(1), columns(2), columns(20)),
+            (1, 1, 2, 6)
+        );
+    }
+
+    #[test]
+    fn a_legend_breaks_into_lines() {
+        let legend: Vec<_> = (0..5).map(|i| (format!("{i} leg"), [0; 3])).collect();
+        let width = 2 * entry_width("0 leg") + 20;
+        let lines: Vec<usize> = places(&legend, width).iter().map(|p| p.1).collect();
+        assert_eq!(lines, [0, 0, 1, 1, 2]);
+        assert_eq!(
+            (legend_lines(&legend, width), legend_lines(&[], width)),
+            (3, 0)
+        );
+    }
+
+    #[test]
+    fn long_names_are_cut() {
+        assert_eq!(fitting("chair", 80), "chair");
+        assert_eq!(fitting("a very long chair", 80), "a very l..");
+    }
+}

@@ -1,0 +1,295 @@
+//! Faces that a person labelled become the labels of all shapes of a collection.
+//!
+//! While nothing is labelled by hand, labels are discovered; from the first correction on they come from the
+//! corrected shapes, the exemplars. A few representative shapes learn first, together: votes through maps from
+//! the exemplars, and a linear discriminant that is trained on the exemplars alone, label them; then once more,
+//! with the discriminant trained anew with the confident faces of all of them (Yarowsky 1995, *Unsupervised
+//! Word Sense Disambiguation Rivaling Supervised Methods*), and they vote for each other. What they have
+//! learnt labels every other shape with a vote and a cut: it does not change until the next correction, so the
+//! order in which those are labelled makes no difference.
+
+use super::place::{FLOOR, carried};
+use super::{DescriptionView, Labelling, Prepared, Vote};
+use crate::labels::cut::cut;
+use crate::labels::{Classifier, Statistics};
+use rayon::iter::{IntoParallelIterator, ParallelIterator};
+
+/// Weights of teaching.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TeachOptions {
+    /// Rounds in which the representatives learn from each other, after the one in which they learn from the
+    /// exemplars alone.
+    pub n_rounds: usize,
+    /// Share of the vote through maps in the log-linear mean with the discriminant.
+    pub vote_share: f64,
+    /// Weight of an exemplar's vote against that of a shape that was labelled by carrying.
+    pub exemplar_trust: f64,
+    /// Weight in the discriminant of a face that a person labelled, against one whose label was discovered.
+    pub pinned_weight: f64,
+    /// Weight of all shapes labelled by carrying together against all exemplars together, in the discriminant.
+    pub carried_weight: f64,
+    /// Least probability of a face that the discriminant is trained on, if no person labelled it.
+    pub confident: f64,
+    /// Boundary strength of the cut.
+    pub strength: f64,
+}
+
+impl Default for TeachOptions {
+    fn default() -> Self {
+        Self {
+            n_rounds: 1,
+            vote_share: 0.5,
+            exemplar_trust: 2.0,
+            pinned_weight: 4.0,
+            carried_weight: 1.0,
+            confident: 0.7,
+            strength: 3.0,
+        }
+    }
+}
+
+/// A representative shape that learns, and teaches the others.
+#[derive(Debug, Clone, Copy)]
+pub struct Lesson<'a> {
+    /// Its arrays.
+    pub shape: DescriptionView<'a>,
+    /// What is derived from them under the collection's normalisation.
+    pub prepared: &'a Prepared,
+    /// Class of each face that a person labelled `(m,)`; empty if none is.
+    pub pinned: &'a [Option<u32>],
+    /// Probabilities `(m, k)`, 0 to 255, of labels that were discovered and still count; empty if none do.
+    pub discovered: &'a [u8],
+}
+
+/// A map between two lessons.
+#[derive(Debug, Clone, Copy)]
+pub struct LessonMap<'a> {
+    /// Labels are carried from this lesson
+    pub from: usize,
+    /// to this one.
+    pub to: usize,
+    /// For each vertex of `to` a vertex of `from`.
+    pub p2p: &'a [u32],
+    /// Descriptor residual of the map.
+    pub residual: f64,
+}
+
+/// What the representatives have learnt.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Taught {
+    /// What makes the discriminant.
+    pub statistics: Statistics,
+    /// Labelling of each lesson.
+    pub labellings: Vec<Labelling>,
+}
+
+/// Teaches the lessons `k` classes. `given` are statistics of faces that count besides those of the lessons: pinned
+/// ones of further exemplars, and discovered ones. Costs a cut for each lesson and round.
+pub fn teach(
+    lessons: &[Lesson<'_>],
+    maps: &[LessonMap<'_>],
+    given: &Statistics,
+    k: usize,
+    options: &TeachOptions,
+) -> Taught {
+    let mut certain = given.clone();
+    for lesson in lessons.iter().filter(|l| !l.pinned.is_empty()) {
+        let class = |f: usize| lesson.pinned[f];
+        let of_shape = Statistics::of_shape(
+            &lesson.prepared.features,
+            &lesson.prepared.surface.area,
+            class,
+            k,
+        );
+        certain.accumulate(&of_shape, options.pinned_weight);
+    }
+    let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
+    let mut statistics = certain.clone();
+    let mut labellings = Vec::new();
+    for round in 0..=options.n_rounds {
+        let classifier = statistics.classifier();
+        labellings = (0..lessons.len())
+            .into_par_iter()
+            .map(|to| {
+                let lesson = &lessons[to];
+                let into: Vec<Vote<'_>> = maps
+                    .iter()
+                    .filter(|m| m.to == to && !votes[m.from].is_empty())
+                    .map(|m| Vote {
+                        faces: lessons[m.from].shape.faces,
+                        probabilities: &votes[m.from],
+                        p2p: m.p2p,
+                        residual: m.residual,
+                        trust: if lessons[m.from].pinned.is_empty() {
+                            1.0
+                        } else {
+                            options.exemplar_trust
+                        },
+                    })
+                    .collect();
+                let evidence = Evidence {
+                    classifier: &classifier,
+                    votes: &into,
+                    vote_share: options.vote_share,
+                    pinned: lesson.pinned,
+                };
+                labelled(
+                    &lesson.shape,
+                    lesson.prepared,
+                    &evidence,
+                    k,
+                    options.strength,
+                )
+            })
+            .collect();
+        if round < options.n_rounds {
+            votes = labellings.iter().map(|l| l.probabilities.clone()).collect();
+            statistics = with_confident(&certain, lessons, &labellings, k, options);
+        }
+    }
+    Taught {
+        statistics,
+        labellings,
+    }
+}
+
+/// Labels a shape from what was taught: votes through maps from exemplars and representatives, the discriminant that
+/// `statistics` make, and the faces a person labelled, which keep their class.
+pub fn label_taught(
+    shape: &DescriptionView<'_>,
+    prepared: &Prepared,
+    statistics: &Statistics,
+    votes: &[Vote<'_>],
+    pinned: &[Option<u32>],
+    options: &TeachOptions,
+) -> Labelling {
+    let evidence = Evidence {
+        classifier: &statistics.classifier(),
+        votes,
+        vote_share: options.vote_share,
+        pinned,
+    };
+    labelled(
+        shape,
+        prepared,
+        &evidence,
+        statistics.counts.len(),
+        options.strength,
+    )
+}
+
+/// Classes of proxy faces `(m,)`, given those of the polygons `(n_polygons,)`: a face is pinned if most of the area that
+/// it stands for is, to the class of most of that.
+pub fn proxy_pins(
+    shape: &DescriptionView<'_>,
+    polygon_class: &[Option<u32>],
+    k: usize,
+) -> Vec<Option<u32>> {
+    let m = shape.faces.len();
+    // Column k is area that is not pinned.
+    let mut area = vec![0.0; m * (k + 1)];
+    for (p, class) in polygon_class.iter().enumerate() {
+        let column = class.map_or(k, |c| c as usize);
+        let face = shape.face_map[p] as usize;
+        area[face * (k + 1) + column] += f64::from(shape.polygon_area[p]).max(1e-300);
+    }
+    let most = |row: &[f64]| {
+        let best = (0..k).max_by(|&a, &b| row[a].total_cmp(&row[b]).then(b.cmp(&a)))?;
+        let pinned: f64 = row[..k].iter().sum();
+        (pinned > row[k]).then_some(best as u32)
+    };
+    area.chunks_exact(k + 1).map(most).collect()
+}
+
+/// What a lesson says before it has learnt anything: what a person pinned, else what was discovered.
+fn first_vote(lesson: &Lesson<'_>, k: usize) -> Vec<u8> {
+    let mut vote = match (lesson.discovered, lesson.pinned) {
+        ([], []) => return Vec::new(),
+        ([], pinned) => vec![0; pinned.len() * k],
+        (discovered, _) => discovered.to_vec(),
+    };
+    for (row, pin) in vote.chunks_exact_mut(k).zip(lesson.pinned) {
+        if let Some(class) = pin {
+            row.fill(0);
+            row[*class as usize] = u8::MAX;
+        }
+    }
+    vote
+}
+
+/// The certain statistics with the confident faces of what was carried, all of them together of a given weight.
+fn with_confident(
+    certain: &Statistics,
+    lessons: &[Lesson<'_>],
+    labellings: &[Labelling],
+    k: usize,
+    options: &TeachOptions,
+) -> Statistics {
+    let dim = certain.sums.len() / k.max(1);
+    let mut carried = Statistics::empty(k, dim);
+    let least = (options.confident * 255.0) as u8;
+    for (lesson, labelling) in lessons.iter().zip(labellings) {
+        let class = |f: usize| {
+            let class = labelling.classes[f];
+            let is_pinned = lesson.pinned.get(f).is_some_and(Option::is_some);
+            let confident = labelling.probabilities[f * k + class as usize] >= least;
+            (confident && !is_pinned).then_some(class)
+        };
+        let of_shape = Statistics::of_shape(
+            &lesson.prepared.features,
+            &lesson.prepared.surface.area,
+            class,
+            k,
+        );
+        carried.accumulate(&of_shape, 1.0);
+    }
+    let total = |s: &Statistics| s.counts.iter().sum::<f64>();
+    let weight = options.carried_weight * total(certain) / total(&carried).max(1e-12);
+    let mut all = certain.clone();
+    all.accumulate(&carried, weight.min(1.0));
+    all
+}
+
+/// What is known of the labels of one shape.
+struct Evidence<'a> {
+    classifier: &'a Classifier,
+    votes: &'a [Vote<'a>],
+    vote_share: f64,
+    pinned: &'a [Option<u32>],
+}
+
+fn labelled(
+    shape: &DescriptionView<'_>,
+    prepared: &Prepared,
+    evidence: &Evidence<'_>,
+    k: usize,
+    strength: f64,
+) -> Labelling {
+    let log_model = evidence.classifier.log_probabilities(&prepared.features);
+    let (carried, weights) = carried(shape, evidence.votes, k);
+    let share = evidence.vote_share;
+    let unary: Vec<f64> = log_model
+        .iter()
+        .enumerate()
+        .map(|(i, log)| {
+            let learnt = -log.max(FLOOR.ln());
+            match carried.get(i) {
+                Some(p) => -share * p.max(FLOOR).ln() + (1.0 - share) * learnt,
+                None => learnt,
+            }
+        })
+        .collect();
+    let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);
+    let classes = cut(&prepared.surface, &unary, k, strength, fixed);
+    let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();
+    for (f, row) in posterior.chunks_exact_mut(k).enumerate() {
+        if let Some(class) = evidence.pinned.get(f).copied().flatten() {
+            row.fill(0.0);
+            row[class as usize] = 1.0;
+            continue;
+        }
+        let sum: f64 = row.iter().sum();
+        row.iter_mut().for_each(|p| *p /= sum);
+    }
+    Labelling::new(classes, &posterior, weights, k)
+}

@@ -1,0 +1,474 @@
+//! A person corrects labels: they are pinned, carried to all other shapes, and can be undone.
+
+use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
+use coseg::Library;
+use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, RequestKey, Up};
+use coseg::synth::{Family, Labelled, family};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Known parts as labels that no discovery would number so.
+fn truth(shape: &Labelled) -> Vec<i32> {
+    shape.labels.iter().map(|l| *l as i32 + 10).collect()
+}
+
+fn correct(library: &Library, shape: &Labelled) {
+    let correction = Correction::Whole(truth(shape));
+    library
+        .correct(COLLECTION, &shape.name, &correction, None)
+        .unwrap();
+}
+
+fn carry(library: &Library) {
+    while library.relabel_next(Some(COLLECTION)).unwrap() {}
+}
+
+/// Share of the faces of the other shapes that have the known label, by id.
+fn right(library: &Library, shapes: &[Labelled], but: &[&str]) -> f64 {
+    let found = all_labels(library);
+    let others: Vec<&Labelled> = shapes
+        .iter()
+        .filter(|s| !but.contains(&s.name.as_str()))
+        .collect();
+    let share = |s: &&Labelled| {
+        let labels = &found[&s.name];
+        let hits = labels.iter().zip(truth(s)).filter(|(l, t)| *l == t).count();
+        hits as f64 / labels.len() as f64
+    };
+    others.iter().map(share).sum::<f64>() / others.len() as f64
+}
+
+fn kinds(library: &Library, since: u64) -> Vec<EventKind> {
+    let events = library.events_since(COLLECTION, since, 10_000).unwrap();
+    events.into_iter().map(|e| e.kind).collect()
+}
+
+fn sequence(library: &Library) -> u64 {
+    library.collection(COLLECTION).unwrap().sequence
+}
+
+#[test]
+fn one_corrected_shape_labels_all_others_by_its_ids() {
+    let shapes = family(Family::Pliers, 21, 9, &SMALL);
+    let (folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes[..7]);
+    let since = sequence(&library);
+    let next = library.suggest(COLLECTION).unwrap();
+    assert_eq!(next.n_corrected, 0);
+    let chosen = shapes.iter().find(|s| s.name == next.shape).unwrap();
+    let correction = Correction::Whole(truth(chosen));
+    let done = library
+        .correct(COLLECTION, &chosen.name, &correction, None)
+        .unwrap();
+    assert_eq!(done.n_faces as usize, chosen.labels.len());
+    assert_eq!((done.n_stale, done.changed_share > 0.99), (6, true));
+    carry(&library);
+
+    let score = right(&library, &shapes[..7], &[&chosen.name]);
+    assert!(score > 0.85, "{score:.3} of the faces are right by id");
+    let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert_eq!(used, (10..13).collect(), "the ids are those of the person");
+    let kinds = kinds(&library, since);
+    let at = |wanted: &dyn Fn(&EventKind) -> bool| kinds.iter().position(wanted);
+    let created = at(&|k| *k == EventKind::LabelCreated { label: 10 }).unwrap();
+    let retired = at(&|k| *k == EventKind::LabelRetired { label: 0 }).unwrap();
+    let corrected = at(&|k| matches!(k, EventKind::Corrected { .. })).unwrap();
+    let carried = kinds
+        .iter()
+        .filter(|k| matches!(k, EventKind::LabelsChanged { cause, .. } if cause == "carrying"));
+    assert!(created < corrected && retired < corrected);
+    assert_eq!(carried.count(), 6);
+    assert!(
+        kinds[corrected + 1..]
+            .iter()
+            .all(|k| matches!(k, EventKind::LabelsChanged { .. }))
+    );
+
+    // Shapes that come later have the same ids, also after the library was closed.
+    let before = all_labels(&library);
+    drop(library);
+    let library = Library::open(folder.path()).unwrap();
+    assert_eq!(all_labels(&library), before);
+    stream(&library, &shapes[7..]);
+    let score = right(&library, &shapes, &[&chosen.name]);
+    assert!(score > 0.85, "{score:.3} of the faces are right by id");
+}
+
+#[test]
+fn undo_goes_back_to_the_first_labels_to_the_byte() {
+    let shapes = family(Family::Pliers, 22, 6, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes[..5]);
+    let snapshot = |library: &Library| -> BTreeMap<String, (Vec<i32>, Vec<f32>)> {
+        let (_, shapes) = library.labels_snapshot(COLLECTION).unwrap();
+        let shapes = shapes.into_iter();
+        shapes
+            .map(|(name, l)| (name, (l.labels, l.confidence)))
+            .collect()
+    };
+    let mut states = vec![snapshot(&library)];
+    correct(&library, &shapes[0]);
+    carry(&library);
+    states.push(snapshot(&library));
+    library.name_label(COLLECTION, 11, "jaw", None).unwrap();
+    // Not carried to the end: what is undone need not be finished.
+    correct(&library, &shapes[1]);
+    library.relabel_next(Some(COLLECTION)).unwrap();
+    library.merge_labels(COLLECTION, 11, 12, None).unwrap();
+
+    let undo = || library.undo(COLLECTION, None).unwrap();
+    assert_eq!(
+        (undo().change, undo().change),
+        ("merge".into(), "correct".into())
+    );
+    assert_eq!(snapshot(&library), states[1]);
+    let name = |id: u32| {
+        let labels = library.collection(COLLECTION).unwrap().labels;
+        labels.into_iter().find(|l| l.id == id).unwrap().name
+    };
+    assert_eq!(name(11).as_deref(), Some("jaw"));
+    assert_eq!(undo().change, "name");
+    assert_eq!(name(11), None);
+    // A shape that came after the correction is labelled by what was discovered, when that is undone.
+    stream(&library, &shapes[5..]);
+    let last = undo();
+    assert_eq!((last.change.as_str(), last.n_left), ("correct", 0));
+    carry(&library);
+    let mut now = snapshot(&library);
+    let newcomer = now.remove(&shapes[5].name).unwrap();
+    assert_eq!(now, states[0]);
+    assert!(newcomer.0.iter().all(|l| (0..3).contains(l)));
+    let nothing = library.undo(COLLECTION, None);
+    assert!(
+        matches!(
+            &nothing,
+            Err(LibraryError::FailedPrecondition {
+                reason: "NOTHING_TO_UNDO",
+                ..
+            })
+        ),
+        "{nothing:?}"
+    );
+    // And the collection lives on.
+    correct(&library, &shapes[2]);
+    carry(&library);
+    assert!(right(&library, &shapes, &[&shapes[2].name]) > 0.8);
+}
+
+#[test]
+fn pinned_faces_never_change_by_themselves() {
+    let shapes = family(Family::Pliers, 23, 12, &SMALL);
+    let (folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes[..4]);
+    // A tenth of one shape, at random as far as its parts are concerned.
+    let faces: Vec<u32> = (0..shapes[1].labels.len() as u32).step_by(10).collect();
+    let some = Correction::Faces {
+        faces: faces.clone(),
+        label: 77,
+    };
+    library
+        .correct(COLLECTION, &shapes[1].name, &some, None)
+        .unwrap();
+    carry(&library);
+    let kept = |library: &Library| {
+        let labels = &all_labels(library)[&shapes[1].name];
+        faces.iter().all(|f| labels[*f as usize] == 77)
+    };
+    assert!(kept(&library));
+    let others: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert!(
+        others.len() > 1,
+        "a correction of a tenth leaves other labels: {others:?}"
+    );
+    correct(&library, &shapes[3]);
+    stream(&library, &shapes[4..9]);
+    assert!(kept(&library));
+    drop(library);
+    let library = Library::open(folder.path()).unwrap();
+    correct(&library, &shapes[6]);
+    stream(&library, &shapes[9..]);
+    assert!(kept(&library));
+    for s in [&shapes[3], &shapes[6]] {
+        assert_eq!(all_labels(&library)[&s.name], truth(s));
+    }
+    // Only a person changes them.
+    let part = Correction::Faces {
+        faces: vec![faces[0]],
+        label: 78,
+    };
+    library
+        .correct(COLLECTION, &shapes[1].name, &part, None)
+        .unwrap();
+    assert_eq!(all_labels(&library)[&shapes[1].name][faces[0] as usize], 78);
+}
+
+#[test]
+fn the_same_correction_again_has_one_effect_and_the_same_reply() {
+    let shapes = family(Family::Pliers, 24, 3, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let key = RequestKey {
+        client_id: "c".into(),
+        request_id: "1".into(),
+    };
+    let correction = Correction::Whole(truth(&shapes[0]));
+    let once = || library.correct(COLLECTION, &shapes[0].name, &correction, Some(&key));
+    let first = once().unwrap();
+    carry(&library);
+    let after = sequence(&library);
+    assert_eq!(once().unwrap(), first);
+    assert_eq!(sequence(&library), after);
+    let other = library.correct(COLLECTION, &shapes[1].name, &correction, Some(&key));
+    assert!(matches!(
+        other,
+        Err(LibraryError::FailedPrecondition {
+            reason: "REQUEST_ID_REUSED",
+            ..
+        })
+    ));
+}
+
+#[test]
+fn wrong_corrections_are_refused_and_change_nothing() {
+    let shapes = family(Family::Pliers, 25, 2, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let n = shapes[0].labels.len();
+    let name = &shapes[0].name;
+    let since = sequence(&library);
+    let mut range = vec![0; n];
+    range[7] = -2;
+    let mut large = vec![0; n];
+    large[9] = 65_536;
+    let faces = |f: u32, label: u32| Correction::Faces {
+        faces: vec![f],
+        label,
+    };
+    for (correction, message) in [
+        (
+            Correction::Whole(vec![1; n - 1]),
+            format!(
+                "{} labels were given, but shape {name:?} has {n} faces",
+                n - 1
+            ),
+        ),
+        (
+            Correction::Whole(range),
+            "the label of face 7 is -2, but must be -1 to 65535".into(),
+        ),
+        (
+            Correction::Whole(large),
+            "the label of face 9 is 65536, but must be -1 to 65535".into(),
+        ),
+        (
+            Correction::Whole(vec![-1; n]),
+            format!("no face of shape {name:?} is given a label, so nothing is corrected"),
+        ),
+        (
+            Correction::Whole((0..n as i32).map(|i| i % 65).collect()),
+            format!("collection {COLLECTION:?} would have 65 labels, the limit is 64"),
+        ),
+        (
+            faces(n as u32, 1),
+            format!("face {n} is named, but shape {name:?} has {n}"),
+        ),
+        (
+            faces(0, 65_536),
+            "the label is 65536, but must be at most 65535".into(),
+        ),
+        (
+            Correction::Part {
+                part: 999,
+                label: 1,
+            },
+            format!(
+                "part 999 is named, but shape {name:?} has {}",
+                library.shape(COLLECTION, name).unwrap().parts.len()
+            ),
+        ),
+    ] {
+        let refused = library.correct(COLLECTION, name, &correction, None);
+        assert_eq!(refused.unwrap_err().to_string(), message);
+    }
+    assert_eq!(kinds(&library, since), []);
+}
+
+#[test]
+fn a_part_is_corrected_as_a_whole() {
+    let shapes = family(Family::Pliers, 26, 5, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let name = &shapes[0].name;
+    let part = &library.shape(COLLECTION, name).unwrap().parts[1];
+    let correction = Correction::Part { part: 1, label: 40 };
+    let done = library
+        .correct(COLLECTION, name, &correction, None)
+        .unwrap();
+    assert!(
+        (done.area_share - part.area_share).abs() < 0.05,
+        "{done:?} {part:?}"
+    );
+    carry(&library);
+    let there = all_labels(&library)[name]
+        .iter()
+        .filter(|l| **l == 40)
+        .count();
+    assert!(there as u64 >= done.n_faces);
+}
+
+#[test]
+fn labels_are_merged_and_split_on_all_shapes() {
+    let shapes = family(Family::Pliers, 27, 6, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    correct(&library, &shapes[0]);
+    carry(&library);
+    let before = all_labels(&library);
+    let (into, n) = library.merge_labels(COLLECTION, 10, 11, None).unwrap();
+    assert_eq!((into.id, into.n_shapes), (11, 6));
+    assert!(n > 0);
+    let merged = |l: &i32| if *l == 10 { 11 } else { *l };
+    for (name, labels) in all_labels(&library) {
+        let expected: Vec<i32> = before[&name].iter().map(merged).collect();
+        assert_eq!(labels, expected, "only the label that is merged changes");
+    }
+    let old = library.collection(COLLECTION).unwrap().labels;
+    let old = old.iter().find(|l| l.id == 10).unwrap();
+    assert_eq!((old.merged_into, old.n_shapes), (Some(11), 0));
+    let again = library.merge_labels(COLLECTION, 10, 12, None);
+    assert_eq!(
+        again.unwrap_err().to_string(),
+        "label 10 was merged into 11"
+    );
+
+    let since = sequence(&library);
+    let (new, n) = library.split_label(COLLECTION, 11, None).unwrap();
+    assert!(n > 0 && new.id > 12, "{new:?}");
+    carry(&library);
+    let split = EventKind::LabelSplit {
+        from: 11,
+        into: vec![new.id],
+    };
+    assert!(kinds(&library, since).contains(&split));
+    let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert_eq!(used, BTreeSet::from([11, 12, new.id as i32]));
+    // What the person had labelled otherwise stays.
+    let exemplar = &all_labels(&library)[&shapes[0].name];
+    for (now, was) in exemplar.iter().zip(&before[&shapes[0].name]) {
+        assert_eq!(*now == 12, *was == 12);
+    }
+    library.undo(COLLECTION, None).unwrap();
+    library.undo(COLLECTION, None).unwrap();
+    assert_eq!(all_labels(&library), before);
+}
+
+#[test]
+fn an_addition_after_a_correction_computes_few_maps_and_relabels_nobody() {
+    let shapes = family(Family::Pliers, 28, 9, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes[..7]);
+    for s in &shapes[..4] {
+        correct(&library, s);
+    }
+    carry(&library);
+    let before = all_labels(&library);
+    let placed = library
+        .add(COLLECTION, file(&shapes[7].name, &shapes[7].mesh))
+        .unwrap();
+    assert_eq!((placed.n_maps as usize, placed.n_relabelled), (MAX_MAPS, 0));
+    let mut after = all_labels(&library);
+    after.remove(&shapes[7].name);
+    assert_eq!(after, before);
+}
+
+#[test]
+fn when_the_correction_is_carried_makes_no_difference() {
+    let shapes = family(Family::Pliers, 29, 9, &SMALL);
+    let run = |eager: bool| {
+        let (folder, library) = library(3, Up::Unknown);
+        stream(&library, &shapes[..6]);
+        for s in &shapes[..2] {
+            correct(&library, s);
+            if eager {
+                carry(&library);
+            }
+        }
+        for s in &shapes[6..] {
+            library.add(COLLECTION, file(&s.name, &s.mesh)).unwrap();
+            if eager {
+                carry(&library);
+            }
+        }
+        carry(&library);
+        drop(folder);
+        all_labels(&library)
+    };
+    assert_eq!(run(true), run(false));
+}
+
+#[test]
+fn the_next_suggestion_is_never_one_that_was_corrected() {
+    let shapes = family(Family::Pliers, 30, 4, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let mut seen = BTreeSet::new();
+    for n in 0..4 {
+        let next = library.suggest(COLLECTION).unwrap();
+        assert_eq!(next.n_corrected, n);
+        assert!(seen.insert(next.shape.clone()) && !next.reason.is_empty());
+        correct(
+            &library,
+            shapes.iter().find(|s| s.name == next.shape).unwrap(),
+        );
+        carry(&library);
+    }
+    let none = library.suggest(COLLECTION).unwrap_err().to_string();
+    assert_eq!(
+        none,
+        "collection \"shapes\" has 4 shapes, and a person labelled 4 of them"
+    );
+}
+
+#[test]
+fn without_its_exemplar_a_collection_keeps_its_labels() {
+    let shapes = family(Family::Pliers, 31, 7, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes[..5]);
+    correct(&library, &shapes[0]);
+    carry(&library);
+    let mut before = all_labels(&library);
+    library.remove(COLLECTION, &shapes[0].name, None).unwrap();
+    carry(&library);
+    before.remove(&shapes[0].name);
+    assert_eq!(all_labels(&library), before);
+    stream(&library, &shapes[5..]);
+    let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert_eq!(used, (10..13).collect());
+}
+
+#[test]
+fn any_order_of_arrival_ends_within_a_point_of_the_batch() {
+    let shapes = family(Family::Pliers, 32, 8, &SMALL);
+    let run = |order: &[usize], corrected_at: usize| {
+        let (_folder, library) = library(3, Up::Unknown);
+        for (n, at) in order.iter().enumerate() {
+            stream(&library, &shapes[*at..=*at]);
+            if n == corrected_at {
+                correct(&library, &shapes[0]);
+            }
+        }
+        carry(&library);
+        right(&library, &shapes, &[&shapes[0].name])
+    };
+    // All shapes are known when the person speaks; against: the first of a stream, forwards and backwards.
+    let batch = run(&[0, 1, 2, 3, 4, 5, 6, 7], 7);
+    let streamed = [
+        run(&[0, 1, 2, 3, 4, 5, 6, 7], 0),
+        run(&[0, 7, 6, 5, 4, 3, 2, 1], 0),
+    ];
+    for score in streamed {
+        assert!(
+            (score - batch).abs() <= 0.01,
+            "{streamed:?} against {batch:.4}"
+        );
+    }
+}
