@@ -389,8 +389,7 @@ fn assemble(
     let mut eigenvalues = Vec::with_capacity(k);
     let mut residuals = Vec::with_capacity(k);
     let mut flat = vec![0.0; n * k];
-    // Where the columns of each panel of each component go.
-    let mut groups: Vec<(usize, usize, Vec<(usize, &mut [f64])>)> = Vec::new();
+    let mut groups: Vec<Group> = Vec::new();
     let mut group_of = HashMap::new();
     for (&(value, c, i), column) in order[..k].iter().zip(flat.chunks_exact_mut(n)) {
         if value < -1e-6 * order[k - 1].0.abs() {
@@ -402,15 +401,20 @@ fn assemble(
         eigenvalues.push(if value < zero { 0.0 } else { value });
         residuals.push(solved[c].residuals[i]);
         let group = *group_of.entry((c, i / WIDTH)).or_insert_with(|| {
-            groups.push((c, i / WIDTH, Vec::with_capacity(WIDTH)));
+            groups.push(Group {
+                component: c,
+                panel: i / WIDTH,
+                columns: Vec::with_capacity(WIDTH),
+            });
             groups.len() - 1
         });
-        groups[group].2.push((i % WIDTH, column));
+        groups[group].columns.push((i % WIDTH, column));
     }
     let by_vertex: Vec<_> = parts.iter().map(Component::rows_by_vertex).collect();
-    let write = |panel: &mut Vec<Row>, (c, p, mut columns): (usize, usize, Vec<_>)| {
-        solved[c].vectors.copy_panel(p, panel);
-        write_columns(&parts[c], panel, &by_vertex[c], &mut columns);
+    let write = |panel: &mut Vec<Row>, group: Group| {
+        let c = group.component;
+        solved[c].vectors.copy_panel(group.panel, panel);
+        group.write(&parts[c], panel, &by_vertex[c]);
     };
     if parallel {
         groups.into_par_iter().for_each_init(Vec::new, write);
@@ -435,31 +439,37 @@ fn assemble(
     })
 }
 
-/// Writes columns of one panel, scaled to A-length 1 and with their canonical signs, in the order of
-/// the vertices: memory is written in sequence, and the eight numbers of a row are read at once.
-fn write_columns(
-    part: &Component,
-    panel: &[Row],
-    by_vertex: &[(u32, u32)],
-    columns: &mut [(usize, &mut [f64])],
-) {
-    let mut largest = [0.0f64; WIDTH];
-    for &(vertex, row) in by_vertex {
-        let scale = part.inverse_sqrt_mass[row as usize];
-        let x = panel[row as usize].0.map(|x| x * scale);
-        for (l, x) in largest.iter_mut().zip(x) {
-            if x.abs() > l.abs() {
-                *l = x;
+/// Where the columns of a panel go.
+struct Group<'a> {
+    component: usize,
+    panel: usize,
+    /// (column of the panel, its place in the result)
+    columns: Vec<(usize, &'a mut [f64])>,
+}
+
+impl Group<'_> {
+    /// Writes the columns, scaled to A-length 1 and with their canonical signs, in the order of the
+    /// vertices: memory is written in sequence, and the eight numbers of a row are read at once.
+    fn write(self, part: &Component, panel: &[Row], by_vertex: &[(u32, u32)]) {
+        let mut largest = [0.0f64; WIDTH];
+        let mut columns = self.columns;
+        for &(vertex, row) in by_vertex {
+            let scale = part.inverse_sqrt_mass[row as usize];
+            let x = panel[row as usize].0.map(|x| x * scale);
+            for (l, x) in largest.iter_mut().zip(x) {
+                if x.abs() > l.abs() {
+                    *l = x;
+                }
+            }
+            for (from, column) in &mut columns {
+                column[vertex as usize] = x[*from];
             }
         }
-        for (from, column) in columns.iter_mut() {
-            column[vertex as usize] = x[*from];
-        }
-    }
-    for (from, column) in columns {
-        if largest[*from] < 0.0 {
-            for &(vertex, _) in by_vertex {
-                column[vertex as usize] *= -1.0;
+        for (from, column) in columns {
+            if largest[from] < 0.0 {
+                for &(vertex, _) in by_vertex {
+                    column[vertex as usize] *= -1.0;
+                }
             }
         }
     }

@@ -127,7 +127,7 @@ fn drum(n: u32, height: f64) -> TriMesh {
 
 #[test]
 fn slivers_have_spectra() {
-    for height in [1.0, 1e-2, 1e-3, 1e-5] {
+    for height in [1.0, 1e-2, 1e-3, 1e-5, 1e-6] {
         let refusals = spectra(&format!("drum {height}"), &drum(40, height));
         assert!(refusals.is_empty(), "{refusals:?}");
     }
