@@ -2,13 +2,13 @@
 
 use super::criterion::{CREASE_SCALE, Criterion};
 use super::discover::Prepared;
-use super::joint::{Rows, combine, embedding, inter_shape, symmetric};
+use super::joint::{Rows, combine, diffusion, embedding, inter_shape, row_normalised, symmetric};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::{PartGraph, merge_patches};
 use std::collections::BTreeSet;
 
 /// Starts of each k-means.
-const N_STARTS: usize = 5;
+const N_STARTS: usize = 3;
 /// Labellings kept by the beam search while merging, and at its end.
 const BEAM_WIDTH: usize = 6;
 const BEAM_KEPT: usize = 3;
@@ -51,7 +51,12 @@ pub(super) fn pool(
     };
     for (g, &(_, alphas, extra)) in granularities.iter().enumerate() {
         let parts = Parts::new(shapes, merged.iter().map(|m| &m[g]));
-        for weighting in &WEIGHTINGS {
+        let n_weightings = if shapes.learnt_metric {
+            1
+        } else {
+            WEIGHTINGS.len()
+        };
+        for weighting in &WEIGHTINGS[..n_weightings] {
             let vectors = parts.vectors(shapes, weighting);
             let dim = vectors.len() / parts.len().max(1);
             let inter = inter_shape(&Rows {
@@ -209,7 +214,8 @@ impl Parts {
             .collect()
     }
 
-    /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group.
+    /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group; in a learnt
+    /// metric, where columns are comparable, scaled as a whole instead.
     fn vectors(&self, shapes: &Prepared<'_>, weighting: &[f64; 10]) -> Vec<f64> {
         let mut column_weights = Vec::with_capacity(shapes.dim);
         for ((_, width), g) in super::features::groups(shapes.up_known)
@@ -219,35 +225,40 @@ impl Parts {
             column_weights.extend(std::iter::repeat_n(g / (*width as f64).sqrt(), *width));
         }
         let n_shape = PartGraph::N_SHAPE;
-        type Block = (fn(&PartGraph) -> &[f64], Vec<f64>);
-        let blocks: [Block; 4] = [
-            (|g| &g.mean, column_weights.clone()),
-            (
-                |g| &g.spread,
-                column_weights.iter().map(|w| w * SPREAD_WEIGHT).collect(),
-            ),
-            (
-                |g| &g.context,
-                column_weights.iter().map(|w| w * CONTEXT_WEIGHT).collect(),
-            ),
-            (
-                |g| &g.shape,
-                vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape],
-            ),
+        let shape_weights = vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape];
+        type Block<'b> = (fn(&PartGraph) -> &[f64], f64, &'b [f64]);
+        let blocks: [Block<'_>; 4] = [
+            (|g| &g.mean, 1.0, &column_weights),
+            (|g| &g.spread, SPREAD_WEIGHT, &column_weights),
+            (|g| &g.context, CONTEXT_WEIGHT, &column_weights),
+            (|g| &g.shape, 1.0, &shape_weights),
         ];
-        let total: usize = blocks.iter().map(|b| b.1.len()).sum();
+        let total: usize = blocks.iter().map(|b| b.2.len()).sum();
         let mut out = vec![0.0; self.len() * total];
         let mut at = 0;
-        for (values, weights) in blocks {
+        for (b, (values, share, weights)) in blocks.into_iter().enumerate() {
             let width = weights.len();
-            for (c, weight) in weights.iter().enumerate() {
-                let column: Vec<f64> = self
-                    .graphs
-                    .iter()
-                    .flat_map(|g| values(g).chunks_exact(width).map(move |row| row[c]))
-                    .collect();
-                for (row, z) in standardised(&column, &self.weights).into_iter().enumerate() {
-                    out[row * total + at + c] = z * weight;
+            let as_a_whole = shapes.learnt_metric && b < 3;
+            let columns: Vec<Column> = (0..width)
+                .map(|c| {
+                    let values = self
+                        .graphs
+                        .iter()
+                        .flat_map(|g| values(g).chunks_exact(width).map(move |row| row[c]));
+                    Column::new(values.collect(), &self.weights)
+                })
+                .collect();
+            let variance: f64 = columns.iter().map(|c| c.variance).sum();
+            let norm: f64 = weights.iter().map(|w| w * w).sum();
+            let as_one = (variance / norm).sqrt() + 1e-9;
+            for (c, (column, weight)) in columns.iter().zip(weights).enumerate() {
+                let (deviation, clip, weight) = if as_a_whole {
+                    (as_one, f64::INFINITY, 1.0)
+                } else {
+                    (column.variance.sqrt() + 1e-9, CLIP, *weight)
+                };
+                for (row, z) in column.scaled(deviation, clip, share * weight).enumerate() {
+                    out[row * total + at + c] = z;
                 }
             }
             at += width;
@@ -256,44 +267,32 @@ impl Parts {
     }
 }
 
-fn standardised(column: &[f64], weights: &[f64]) -> Vec<f64> {
-    let total: f64 = weights.iter().sum();
-    let mean = column.iter().zip(weights).map(|(x, w)| x * w).sum::<f64>() / total;
-    let variance = column
-        .iter()
-        .zip(weights)
-        .map(|(x, w)| w * (x - mean) * (x - mean))
-        .sum::<f64>()
-        / total;
-    let deviation = variance.sqrt() + 1e-9;
-    column
-        .iter()
-        .map(|x| ((x - mean) / deviation).clamp(-CLIP, CLIP))
-        .collect()
+/// One column of part vectors, centred.
+struct Column {
+    centred: Vec<f64>,
+    variance: f64,
 }
 
-/// The first `width` eigenvectors, rows scaled to length 1 (Ng, Jordan and Weiss 2001).
-fn row_normalised(basis: &nalgebra::DMatrix<f64>, width: usize) -> Vec<f64> {
-    let mut out = Vec::with_capacity(basis.nrows() * width);
-    for row in basis.row_iter() {
-        let norm = row.columns(0, width).norm().max(1e-9);
-        out.extend(row.iter().take(width).map(|x| x / norm));
+impl Column {
+    fn new(mut values: Vec<f64>, weights: &[f64]) -> Self {
+        let total: f64 = weights.iter().sum();
+        let mean = values.iter().zip(weights).map(|(x, w)| x * w).sum::<f64>() / total;
+        values.iter_mut().for_each(|x| *x -= mean);
+        let variance = values
+            .iter()
+            .zip(weights)
+            .map(|(x, w)| w * x * x)
+            .sum::<f64>()
+            / total;
+        Self {
+            centred: values,
+            variance,
+        }
     }
-    out
-}
 
-/// Diffusion coordinates after three steps, without the constant one (Coifman and Lafon 2006).
-fn diffusion(
-    values: &[f64],
-    basis: &nalgebra::DMatrix<f64>,
-    degrees: &[f64],
-    width: usize,
-) -> Vec<f64> {
-    let mut out = Vec::with_capacity(basis.nrows() * (width - 1));
-    for (row, degree) in basis.row_iter().zip(degrees) {
-        out.extend(
-            (1..width).map(|c| row[c] / degree.sqrt().max(1e-12) * values[c].max(0.0).powi(3)),
-        );
+    /// Over `deviation` and clipped there, times `weight`.
+    fn scaled(&self, deviation: f64, clip: f64, weight: f64) -> impl Iterator<Item = f64> {
+        let scale = move |x: &f64| weight * (x / deviation).clamp(-clip, clip);
+        self.centred.iter().map(scale)
     }
-    out
 }

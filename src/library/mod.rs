@@ -41,7 +41,7 @@ mod submit;
 mod types;
 
 pub use error::LibraryError;
-pub use place::{MAX_MAPS, MAX_REPRESENTATIVES};
+pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
 pub use rows::report_to_json;
 pub use types::{
     CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,

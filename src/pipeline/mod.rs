@@ -10,5 +10,5 @@ pub use describe::{
 };
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
-    LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, recluster,
+    LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, batch, recluster,
 };
