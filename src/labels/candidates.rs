@@ -5,7 +5,9 @@ use super::discover::Prepared;
 use super::joint::{Rows, combine, diffusion, embedding, inter_shape, row_normalised, symmetric};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::{PartGraph, merge_patches};
+use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
 
 /// Starts of each k-means.
 const N_STARTS: usize = 3;
@@ -49,42 +51,35 @@ pub(super) fn pool(
         seen: BTreeSet::new(),
         labellings: Vec::new(),
     };
-    for (g, &(_, alphas, extra)) in granularities.iter().enumerate() {
-        let parts = Parts::new(shapes, merged.iter().map(|m| &m[g]));
-        let n_weightings = if shapes.learnt_metric {
-            1
-        } else {
-            WEIGHTINGS.len()
-        };
-        for weighting in &WEIGHTINGS[..n_weightings] {
-            let vectors = parts.vectors(shapes, weighting);
-            let dim = vectors.len() / parts.len().max(1);
-            let inter = inter_shape(&Rows {
-                values: &vectors,
-                dim,
-                offsets: &parts.offsets,
-            });
-            let embeddings: Vec<_> = alphas
-                .iter()
-                .map(|alpha| embedding(&combine(&inter, &parts.touching, *alpha), k + extra + 1))
-                .collect();
-            for n_labels in k..=k + extra {
-                let mut take = |points: &[f64], dim: usize| {
-                    let of_part = kmeans(points, dim, &parts.weights, n_labels, seed, N_STARTS);
-                    let of_patch = parts.patch_labels(&of_part);
-                    found.add_merged(criterion, of_patch, n_labels);
-                };
-                take(&vectors, dim);
-                for (values, basis, degrees) in &embeddings {
-                    let width = n_labels.min(basis.ncols());
-                    take(&row_normalised(basis, width), width);
-                    let next = (n_labels + 1).min(basis.ncols());
-                    take(&diffusion(values, basis, degrees, next), next - 1);
-                }
-            }
-        }
+    let parts: Vec<Parts> = (0..granularities.len())
+        .map(|g| Parts::new(shapes, merged.iter().map(|m| &m[g])))
+        .collect();
+    let n_weightings = if shapes.learnt_metric {
+        1
+    } else {
+        WEIGHTINGS.len()
+    };
+    let views: Vec<(usize, &[f64; 10])> = (0..granularities.len())
+        .flat_map(|g| WEIGHTINGS[..n_weightings].iter().map(move |w| (g, w)))
+        .collect();
+    let groupings: Vec<Vec<Grouping>> = views
+        .par_iter()
+        .map(|&(g, weighting)| {
+            let (_, alphas, extra) = granularities[g];
+            let vectors = parts[g].vectors(shapes, weighting);
+            parts[g].groupings(&vectors, alphas, k..=k + extra, seed)
+        })
+        .collect();
+    for grouping in groupings.into_iter().flatten() {
+        found.add_merged(criterion, grouping.of_patch, grouping.n_labels);
     }
     found.labellings
+}
+
+/// A grouping of all patches.
+struct Grouping {
+    n_labels: usize,
+    of_patch: Vec<u32>,
 }
 
 struct Pool {
@@ -205,6 +200,46 @@ impl Parts {
 
     fn len(&self) -> usize {
         self.weights.len()
+    }
+
+    /// Groups the parts by their vectors and by the joint graph at each share of the intra-shape graph, into each
+    /// number of labels.
+    fn groupings(
+        &self,
+        vectors: &[f64],
+        alphas: &[f64],
+        sizes: RangeInclusive<usize>,
+        seed: u64,
+    ) -> Vec<Grouping> {
+        let dim = vectors.len() / self.len().max(1);
+        let inter = inter_shape(&Rows {
+            values: vectors,
+            dim,
+            offsets: &self.offsets,
+        });
+        let most = sizes.end() + 1;
+        let embeddings: Vec<_> = alphas
+            .iter()
+            .map(|alpha| embedding(&combine(&inter, &self.touching, *alpha), most))
+            .collect();
+        let mut found = Vec::new();
+        for n_labels in sizes {
+            let mut take = |points: &[f64], dim: usize| {
+                let of_part = kmeans(points, dim, &self.weights, n_labels, seed, N_STARTS);
+                found.push(Grouping {
+                    n_labels,
+                    of_patch: self.patch_labels(&of_part),
+                });
+            };
+            take(vectors, dim);
+            for (values, basis, degrees) in &embeddings {
+                let width = n_labels.min(basis.ncols());
+                take(&row_normalised(basis, width), width);
+                let next = (n_labels + 1).min(basis.ncols());
+                take(&diffusion(values, basis, degrees, next), next - 1);
+            }
+        }
+        found
     }
 
     fn patch_labels(&self, of_part: &[u32]) -> Vec<u32> {

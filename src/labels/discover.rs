@@ -12,6 +12,7 @@ use super::judge::Judge;
 use super::patchwise::{Patchwise, in_metric};
 use super::{Features, Statistics};
 use crate::segmentation::{PatchGraph, Surface};
+use rayon::prelude::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
 /// Labellings from which a metric is learnt.
 const N_TEACHERS: usize = 10;
@@ -252,7 +253,13 @@ fn choose(
 ) -> Option<Discovery> {
     let patchwise = Patchwise::new(shapes);
     let candidates = pool(shapes, criterion, k, seed);
-    let mut refined: Vec<Vec<u32>> = candidates.iter().map(|l| patchwise.refine(l, k)).collect();
+    let refined_all = |labellings: &[Vec<u32>]| -> Vec<Vec<u32>> {
+        labellings
+            .par_iter()
+            .map(|l| patchwise.refine(l, k))
+            .collect()
+    };
+    let mut refined = refined_all(&candidates);
     let mut judge = Judge::new(criterion, candidates, &shapes.area, k);
     let teachers = judge.best(&refined, N_TEACHERS);
     let teachers: Vec<&Vec<u32>> = teachers.iter().map(|&c| &refined[c]).collect();
@@ -276,12 +283,12 @@ fn choose(
             ..Prepared::new(&input)
         };
         let more = pool(&in_metric, criterion, k, seed);
-        refined.extend(more.iter().map(|l| patchwise.refine(l, k)));
+        refined.extend(refined_all(&more));
         judge = judge.with_more(more);
     }
     let on_faces: Vec<Vec<Vec<u32>>> = judge
         .best(&refined, SHORTLIST)
-        .into_iter()
+        .into_par_iter()
         .map(|c| refine(shapes.input, shapes.on_faces(&refined[c]), k))
         .collect();
     let as_patches: Vec<Vec<u32>> = on_faces.iter().map(|l| shapes.majority(l, k)).collect();
