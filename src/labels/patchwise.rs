@@ -181,10 +181,10 @@ mod tests {
 
     #[test]
     fn wrong_patches_are_put_right_and_no_label_is_lost() {
-        let strips = Strips::new(4, 3, 0.3);
+        let strips = Strips::new(20, 3, 0.3);
         let input = strips.input();
         let shapes = Prepared::new(&input);
-        let truth: Vec<u32> = (0..4).flat_map(|_| (0..18).map(|p| p / 6)).collect();
+        let truth: Vec<u32> = (0..20).flat_map(|_| (0..18).map(|p| p / 6)).collect();
         let mut spoilt = truth.clone();
         for p in (0..spoilt.len()).step_by(7) {
             spoilt[p] = (spoilt[p] + 1) % 3;
