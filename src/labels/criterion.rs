@@ -10,7 +10,8 @@ use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
 use sprs::CsMat;
 
-const CONCAVITY_WEIGHT: f64 = 0.5;
+/// Weight of the log of the concavity, in the score and in the value of a labelling.
+pub(super) const CONCAVITY_WEIGHT: f64 = 0.5;
 /// Share of the intra-shape graph in the joint patch graph.
 const ALPHA: f64 = 0.5;
 /// Crease at which the affinity of touching patches has fallen to 1/e.

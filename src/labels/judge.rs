@@ -1,10 +1,10 @@
 //! Which of many candidate labellings is best, when nothing is known but the shapes.
 //!
-//! The value of a labelling is the log of how concave its boundaries are plus how much it agrees with the other
-//! candidates, each counting by its score. The two err in different ways: a few very concave boundaries may
+//! The value of a labelling is half the log of how concave its boundaries are plus how much it agrees with the
+//! other candidates, each counting by its score. The two err in different ways: a few very concave boundaries may
 //! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs.
 
-use super::criterion::Criterion;
+use super::criterion::{CONCAVITY_WEIGHT, Criterion};
 use nalgebra::DMatrix;
 
 /// Temperature of the scores when the candidates vote.
@@ -64,7 +64,7 @@ impl<'a> Judge<'a> {
             .zip(self.consensus(labellings, k))
             .map(|(l, c)| {
                 let sums = self.criterion.pair_sums(l, k);
-                self.criterion.concavity(&sums).max(1e-3).ln() + c
+                CONCAVITY_WEIGHT * self.criterion.concavity(&sums).max(1e-3).ln() + c
             })
             .collect()
     }
