@@ -4,6 +4,7 @@ mod corrections;
 
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 
+use crate::commands::bench::Bench;
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
@@ -126,6 +127,9 @@ pub(crate) enum Command {
     Synth(SynthArgs),
     /// Run the main job on a made family, end to end, in a temporary library
     Demo(DemoArgs),
+    /// Measure on meshes with known answers, in temporary libraries
+    #[command(subcommand)]
+    Bench(Bench),
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
     /// Check or show the daemon's configuration
@@ -198,7 +202,7 @@ impl Settings {
     }
 }
 
-fn up(text: &str) -> Result<wire::Up, String> {
+pub(crate) fn up(text: &str) -> Result<wire::Up, String> {
     Ok(match text.to_ascii_lowercase().as_str() {
         "+x" | "x" => wire::Up::PlusX,
         "-x" => wire::Up::MinusX,

@@ -26,7 +26,7 @@ use std::time::{Duration, Instant};
 /// Most faces of a shape; more take longer than a demonstration should.
 const MOST_FACES: i64 = 200_000;
 /// How long the daemon may take to end; it has nothing left to do by then.
-const DRAIN_LIMIT: Duration = Duration::from_secs(30);
+pub(super) const DRAIN_LIMIT: Duration = Duration::from_secs(30);
 
 /// `coseg demo`
 #[derive(Debug, Clone, Args)]
@@ -60,10 +60,10 @@ pub(crate) struct DemoArgs {
 }
 
 /// A private folder that goes away with it.
-struct Scratch(PathBuf);
+pub(super) struct Scratch(pub(super) PathBuf);
 
 impl Scratch {
-    fn create() -> Result<Self, CommandError> {
+    pub(super) fn create() -> Result<Self, CommandError> {
         // Process ids come again, in containers all the time, and a killed demonstration cleans nothing.
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let (id, nanos) = (std::process::id(), since.map_or(0, |d| d.as_nanos()));
@@ -102,6 +102,7 @@ pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
 
     // Dropped after the daemon has ended, since that has files there.
     let scratch = Scratch::create()?;
+    log_warnings()?;
     let running = start(&scratch.0)?;
     let global = Global {
         endpoint: Some(running.endpoint().to_string()),
@@ -128,22 +129,27 @@ pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
     done
 }
 
-fn at(path: &Path, source: std::io::Error) -> CommandError {
+pub(super) fn at(path: &Path, source: std::io::Error) -> CommandError {
     CommandError::File {
         path: path.display().to_string(),
         source,
     }
 }
 
+/// Logs warnings only; once in a process.
+pub(super) fn log_warnings() -> Result<(), CommandError> {
+    telemetry::start(&Log {
+        level: "warn".to_owned(),
+        ..Config::default().log
+    })?;
+    Ok(())
+}
+
 /// A daemon with default settings on an empty library.
-fn start(directory: &Path) -> Result<Running, CommandError> {
+pub(super) fn start(directory: &Path) -> Result<Running, CommandError> {
     let mut config = Config::default();
     config.server.endpoint = format!("ipc://{}/coseg.sock", directory.display());
     config.server.library = directory.join("library");
-    telemetry::start(&Log {
-        level: "warn".to_owned(),
-        ..config.log.clone()
-    })?;
     Ok(daemon::start(config).map_err(ServeError::Start)?)
 }
 

@@ -1,6 +1,8 @@
 //! What each subcommand does: one file each.
 
 mod add;
+pub(crate) mod bench;
+mod bench_labels;
 mod check;
 mod collections;
 mod config;
@@ -148,6 +150,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
             .map(|()| true)
             .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
+        Command::Bench(args) => bench::run(args, &cli.global),
         Command::Stats => stats::run(session()?),
         Command::Stop => stop::run(session()?),
     }?;

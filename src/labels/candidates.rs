@@ -2,13 +2,15 @@
 
 use super::criterion::{CREASE_SCALE, Criterion};
 use super::discover::Prepared;
-use super::joint::{Rows, combine, embedding, inter_shape, symmetric};
+use super::joint::{Rows, combine, diffusion, embedding, inter_shape, row_normalised, symmetric};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::{PartGraph, merge_patches};
+use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
 
 /// Starts of each k-means.
-const N_STARTS: usize = 5;
+const N_STARTS: usize = 3;
 /// Labellings kept by the beam search while merging, and at its end.
 const BEAM_WIDTH: usize = 6;
 const BEAM_KEPT: usize = 3;
@@ -49,37 +51,35 @@ pub(super) fn pool(
         seen: BTreeSet::new(),
         labellings: Vec::new(),
     };
-    for (g, &(_, alphas, extra)) in granularities.iter().enumerate() {
-        let parts = Parts::new(shapes, merged.iter().map(|m| &m[g]));
-        for weighting in &WEIGHTINGS {
-            let vectors = parts.vectors(shapes, weighting);
-            let dim = vectors.len() / parts.len().max(1);
-            let inter = inter_shape(&Rows {
-                values: &vectors,
-                dim,
-                offsets: &parts.offsets,
-            });
-            let embeddings: Vec<_> = alphas
-                .iter()
-                .map(|alpha| embedding(&combine(&inter, &parts.touching, *alpha), k + extra + 1))
-                .collect();
-            for n_labels in k..=k + extra {
-                let mut take = |points: &[f64], dim: usize| {
-                    let of_part = kmeans(points, dim, &parts.weights, n_labels, seed, N_STARTS);
-                    let of_patch = parts.patch_labels(&of_part);
-                    found.add_merged(criterion, of_patch, n_labels);
-                };
-                take(&vectors, dim);
-                for (values, basis, degrees) in &embeddings {
-                    let width = n_labels.min(basis.ncols());
-                    take(&row_normalised(basis, width), width);
-                    let next = (n_labels + 1).min(basis.ncols());
-                    take(&diffusion(values, basis, degrees, next), next - 1);
-                }
-            }
-        }
+    let parts: Vec<Parts> = (0..granularities.len())
+        .map(|g| Parts::new(shapes, merged.iter().map(|m| &m[g])))
+        .collect();
+    let n_weightings = if shapes.learnt_metric {
+        1
+    } else {
+        WEIGHTINGS.len()
+    };
+    let views: Vec<(usize, &[f64; 10])> = (0..granularities.len())
+        .flat_map(|g| WEIGHTINGS[..n_weightings].iter().map(move |w| (g, w)))
+        .collect();
+    let groupings: Vec<Vec<Grouping>> = views
+        .par_iter()
+        .map(|&(g, weighting)| {
+            let (_, alphas, extra) = granularities[g];
+            let vectors = parts[g].vectors(shapes, weighting);
+            parts[g].groupings(&vectors, alphas, k..=k + extra, seed)
+        })
+        .collect();
+    for grouping in groupings.into_iter().flatten() {
+        found.add_merged(criterion, grouping.of_patch, grouping.n_labels);
     }
     found.labellings
+}
+
+/// A grouping of all patches.
+struct Grouping {
+    n_labels: usize,
+    of_patch: Vec<u32>,
 }
 
 struct Pool {
@@ -202,6 +202,46 @@ impl Parts {
         self.weights.len()
     }
 
+    /// Groups the parts by their vectors and by the joint graph at each share of the intra-shape graph, into each
+    /// number of labels.
+    fn groupings(
+        &self,
+        vectors: &[f64],
+        alphas: &[f64],
+        sizes: RangeInclusive<usize>,
+        seed: u64,
+    ) -> Vec<Grouping> {
+        let dim = vectors.len() / self.len().max(1);
+        let inter = inter_shape(&Rows {
+            values: vectors,
+            dim,
+            offsets: &self.offsets,
+        });
+        let most = sizes.end() + 1;
+        let embeddings: Vec<_> = alphas
+            .iter()
+            .map(|alpha| embedding(&combine(&inter, &self.touching, *alpha), most))
+            .collect();
+        let mut found = Vec::new();
+        for n_labels in sizes {
+            let mut take = |points: &[f64], dim: usize| {
+                let of_part = kmeans(points, dim, &self.weights, n_labels, seed, N_STARTS);
+                found.push(Grouping {
+                    n_labels,
+                    of_patch: self.patch_labels(&of_part),
+                });
+            };
+            take(vectors, dim);
+            for (values, basis, degrees) in &embeddings {
+                let width = n_labels.min(basis.ncols());
+                take(&row_normalised(basis, width), width);
+                let next = (n_labels + 1).min(basis.ncols());
+                take(&diffusion(values, basis, degrees, next), next - 1);
+            }
+        }
+        found
+    }
+
     fn patch_labels(&self, of_part: &[u32]) -> Vec<u32> {
         self.part_of_patch
             .iter()
@@ -209,7 +249,8 @@ impl Parts {
             .collect()
     }
 
-    /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group.
+    /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group; in a learnt
+    /// metric, where columns are comparable, scaled as a whole instead.
     fn vectors(&self, shapes: &Prepared<'_>, weighting: &[f64; 10]) -> Vec<f64> {
         let mut column_weights = Vec::with_capacity(shapes.dim);
         for ((_, width), g) in super::features::groups(shapes.up_known)
@@ -219,35 +260,40 @@ impl Parts {
             column_weights.extend(std::iter::repeat_n(g / (*width as f64).sqrt(), *width));
         }
         let n_shape = PartGraph::N_SHAPE;
-        type Block = (fn(&PartGraph) -> &[f64], Vec<f64>);
-        let blocks: [Block; 4] = [
-            (|g| &g.mean, column_weights.clone()),
-            (
-                |g| &g.spread,
-                column_weights.iter().map(|w| w * SPREAD_WEIGHT).collect(),
-            ),
-            (
-                |g| &g.context,
-                column_weights.iter().map(|w| w * CONTEXT_WEIGHT).collect(),
-            ),
-            (
-                |g| &g.shape,
-                vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape],
-            ),
+        let shape_weights = vec![SHAPE_WEIGHT / (n_shape as f64).sqrt(); n_shape];
+        type Block<'b> = (fn(&PartGraph) -> &[f64], f64, &'b [f64]);
+        let blocks: [Block<'_>; 4] = [
+            (|g| &g.mean, 1.0, &column_weights),
+            (|g| &g.spread, SPREAD_WEIGHT, &column_weights),
+            (|g| &g.context, CONTEXT_WEIGHT, &column_weights),
+            (|g| &g.shape, 1.0, &shape_weights),
         ];
-        let total: usize = blocks.iter().map(|b| b.1.len()).sum();
+        let total: usize = blocks.iter().map(|b| b.2.len()).sum();
         let mut out = vec![0.0; self.len() * total];
         let mut at = 0;
-        for (values, weights) in blocks {
+        for (b, (values, share, weights)) in blocks.into_iter().enumerate() {
             let width = weights.len();
-            for (c, weight) in weights.iter().enumerate() {
-                let column: Vec<f64> = self
-                    .graphs
-                    .iter()
-                    .flat_map(|g| values(g).chunks_exact(width).map(move |row| row[c]))
-                    .collect();
-                for (row, z) in standardised(&column, &self.weights).into_iter().enumerate() {
-                    out[row * total + at + c] = z * weight;
+            let as_a_whole = shapes.learnt_metric && b < 3;
+            let columns: Vec<Column> = (0..width)
+                .map(|c| {
+                    let values = self
+                        .graphs
+                        .iter()
+                        .flat_map(|g| values(g).chunks_exact(width).map(move |row| row[c]));
+                    Column::new(values.collect(), &self.weights)
+                })
+                .collect();
+            let variance: f64 = columns.iter().map(|c| c.variance).sum();
+            let norm: f64 = weights.iter().map(|w| w * w).sum();
+            let as_one = (variance / norm).sqrt() + 1e-9;
+            for (c, (column, weight)) in columns.iter().zip(weights).enumerate() {
+                let (deviation, clip, weight) = if as_a_whole {
+                    (as_one, f64::INFINITY, 1.0)
+                } else {
+                    (column.variance.sqrt() + 1e-9, CLIP, *weight)
+                };
+                for (row, z) in column.scaled(deviation, clip, share * weight).enumerate() {
+                    out[row * total + at + c] = z;
                 }
             }
             at += width;
@@ -256,44 +302,32 @@ impl Parts {
     }
 }
 
-fn standardised(column: &[f64], weights: &[f64]) -> Vec<f64> {
-    let total: f64 = weights.iter().sum();
-    let mean = column.iter().zip(weights).map(|(x, w)| x * w).sum::<f64>() / total;
-    let variance = column
-        .iter()
-        .zip(weights)
-        .map(|(x, w)| w * (x - mean) * (x - mean))
-        .sum::<f64>()
-        / total;
-    let deviation = variance.sqrt() + 1e-9;
-    column
-        .iter()
-        .map(|x| ((x - mean) / deviation).clamp(-CLIP, CLIP))
-        .collect()
+/// One column of part vectors, centred.
+struct Column {
+    centred: Vec<f64>,
+    variance: f64,
 }
 
-/// The first `width` eigenvectors, rows scaled to length 1 (Ng, Jordan and Weiss 2001).
-fn row_normalised(basis: &nalgebra::DMatrix<f64>, width: usize) -> Vec<f64> {
-    let mut out = Vec::with_capacity(basis.nrows() * width);
-    for row in basis.row_iter() {
-        let norm = row.columns(0, width).norm().max(1e-9);
-        out.extend(row.iter().take(width).map(|x| x / norm));
+impl Column {
+    fn new(mut values: Vec<f64>, weights: &[f64]) -> Self {
+        let total: f64 = weights.iter().sum();
+        let mean = values.iter().zip(weights).map(|(x, w)| x * w).sum::<f64>() / total;
+        values.iter_mut().for_each(|x| *x -= mean);
+        let variance = values
+            .iter()
+            .zip(weights)
+            .map(|(x, w)| w * x * x)
+            .sum::<f64>()
+            / total;
+        Self {
+            centred: values,
+            variance,
+        }
     }
-    out
-}
 
-/// Diffusion coordinates after three steps, without the constant one (Coifman and Lafon 2006).
-fn diffusion(
-    values: &[f64],
-    basis: &nalgebra::DMatrix<f64>,
-    degrees: &[f64],
-    width: usize,
-) -> Vec<f64> {
-    let mut out = Vec::with_capacity(basis.nrows() * (width - 1));
-    for (row, degree) in basis.row_iter().zip(degrees) {
-        out.extend(
-            (1..width).map(|c| row[c] / degree.sqrt().max(1e-12) * values[c].max(0.0).powi(3)),
-        );
+    /// Over `deviation` and clipped there, times `weight`.
+    fn scaled(&self, deviation: f64, clip: f64, weight: f64) -> impl Iterator<Item = f64> {
+        let scale = move |x: &f64| weight * (x / deviation).clamp(-clip, clip);
+        self.centred.iter().map(scale)
     }
-    out
 }

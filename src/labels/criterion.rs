@@ -10,7 +10,8 @@ use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
 use sprs::CsMat;
 
-const CONCAVITY_WEIGHT: f64 = 0.5;
+/// Weight of the log of the concavity, in the score and in the value of a labelling.
+pub(super) const CONCAVITY_WEIGHT: f64 = 0.5;
 /// Share of the intra-shape graph in the joint patch graph.
 const ALPHA: f64 = 0.5;
 /// Crease at which the affinity of touching patches has fallen to 1/e.
@@ -94,14 +95,16 @@ impl Criterion {
         sums
     }
 
+    /// How concave the boundaries between labels are: length-weighted mean crease relative to that of all patch
+    /// boundaries.
+    pub(super) fn concavity(&self, sums: &PairSums) -> f64 {
+        let boundary = sums.between(&sums.creased) / sums.between(&sums.length).max(1e-9);
+        boundary / self.mean_crease.max(1e-300)
+    }
+
     /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
     pub(super) fn score(&self, sums: &PairSums) -> f64 {
         let k = sums.k;
-        let off_diagonal = |m: &[f64]| -> f64 {
-            m.iter().sum::<f64>() - (0..k).map(|l| m[l * k + l]).sum::<f64>()
-        };
-        let boundary = off_diagonal(&sums.creased) / off_diagonal(&sums.length).max(1e-9);
-        let concavity = boundary / self.mean_crease.max(1e-300);
         let total: f64 = sums.affinity.iter().sum::<f64>().max(1e-300);
         let modularity: f64 = (0..k)
             .map(|l| {
@@ -109,11 +112,16 @@ impl Criterion {
                 sums.affinity[l * k + l] / total - (volume / total).powi(2)
             })
             .sum();
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln() + modularity.max(1e-6).ln()
+        CONCAVITY_WEIGHT * self.concavity(sums).max(1e-3).ln() + modularity.max(1e-6).ln()
     }
 }
 
 impl PairSums {
+    /// What lies between different labels.
+    fn between(&self, m: &[f64]) -> f64 {
+        m.iter().sum::<f64>() - (0..self.k).map(|l| m[l * self.k + l]).sum::<f64>()
+    }
+
     /// The sums after label `b` is merged into `a`, and labels above `b` move down by one.
     pub(super) fn merged(&self, a: usize, b: usize) -> Self {
         let k = self.k - 1;

@@ -8,16 +8,16 @@
 use super::candidates::pool;
 use super::criterion::Criterion;
 use super::cut::cut;
+use super::judge::Judge;
+use super::patchwise::{Patchwise, in_metric};
 use super::{Features, Statistics};
 use crate::segmentation::{PatchGraph, Surface};
-use nalgebra::DMatrix;
+use rayon::prelude::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
-/// Temperature of the scores when the pool votes on its own members.
-const TEMPERATURE: f64 = 0.1;
-/// Weight of the consensus beside the score.
-const CONSENSUS_WEIGHT: f64 = 0.5;
-/// Candidates that are refined before the choice is made.
-const SHORTLIST: usize = 8;
+/// Labellings from which a metric is learnt.
+const N_TEACHERS: usize = 10;
+/// Candidates that are refined face by face before the choice is made.
+const SHORTLIST: usize = 4;
 /// Rounds of classifier and cut, and the area share of change below which they stop.
 const REFINEMENTS: usize = 2;
 const SETTLED: f64 = 0.003;
@@ -73,7 +73,7 @@ pub struct Discovery {
     pub labels: Vec<Vec<u32>>,
     /// Number of labels.
     pub n_labels: usize,
-    /// Its value: score plus consensus.
+    /// Its value: half the log concavity of its boundaries plus consensus with the candidates.
     pub value: f64,
     /// The value of the labelling that is there, judged by the same candidates; negative infinity without one.
     pub current_value: f64,
@@ -89,18 +89,20 @@ pub(super) struct PreparedShape<'a> {
 
 /// The input with what every step needs of it.
 pub(super) struct Prepared<'a> {
-    input: &'a DiscoveryInput<'a>,
+    pub(super) input: &'a DiscoveryInput<'a>,
     pub(super) dim: usize,
     pub(super) up_known: bool,
-    means: Vec<f64>,
+    /// Whether the features are in a learnt metric, in which columns are comparable.
+    pub(super) learnt_metric: bool,
+    pub(super) means: Vec<f64>,
     /// Where the patches of each shape begin.
-    offsets: Vec<usize>,
+    pub(super) offsets: Vec<usize>,
     /// Area share of each patch, summing to the number of shapes.
-    area: Vec<f64>,
+    pub(super) area: Vec<f64>,
 }
 
 impl<'a> Prepared<'a> {
-    fn new(input: &'a DiscoveryInput<'a>) -> Self {
+    pub(super) fn new(input: &'a DiscoveryInput<'a>) -> Self {
         let dim = input.shapes.first().map_or(0, |s| s.features.dim);
         let (mut means, mut offsets, mut area) = (Vec::new(), vec![0], Vec::new());
         for s in &input.shapes {
@@ -116,6 +118,7 @@ impl<'a> Prepared<'a> {
             input,
             dim,
             up_known: input.up_known,
+            learnt_metric: false,
             means,
             offsets,
             area,
@@ -135,13 +138,13 @@ impl<'a> Prepared<'a> {
             })
     }
 
-    fn criterion(&self) -> Criterion {
+    pub(super) fn criterion(&self) -> Criterion {
         let patches: Vec<&PatchGraph> = self.input.shapes.iter().map(|s| s.patches).collect();
         Criterion::new(&patches, &self.means, self.dim, &self.offsets)
     }
 
     /// A labelling of all patches, face by face.
-    fn on_faces(&self, of_patch: &[u32]) -> Vec<Vec<u32>> {
+    pub(super) fn on_faces(&self, of_patch: &[u32]) -> Vec<Vec<u32>> {
         let shapes = self.input.shapes.iter().zip(&self.offsets);
         shapes
             .map(|(s, o)| {
@@ -200,13 +203,10 @@ pub fn discover(
     }
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();
-    let range = match options.n_labels {
-        Some(k) => k..=k,
-        None => 2..=options.max_labels.max(2),
-    };
-    let chosen = range
-        .filter_map(|k| choose(&shapes, &criterion, k, options.seed, current))
-        .reduce(|best, next| if next.value > best.value { next } else { best });
+    let k = options
+        .n_labels
+        .unwrap_or_else(|| estimate(&shapes, &criterion, options));
+    let chosen = choose(&shapes, &criterion, k, options.seed, current);
     chosen.unwrap_or_else(|| {
         // Fewer patches than labels: each patch its own.
         let labels = input
@@ -229,96 +229,21 @@ pub fn discover(
     })
 }
 
-/// Judges labellings: by the criterion, and by how much they agree with what the good candidates agree on.
-struct Judge<'a> {
-    criterion: &'a Criterion,
-    /// Candidate labellings of all patches, and the softmax of their scores.
-    candidates: Vec<Vec<u32>>,
-    weights: Vec<f64>,
-    area: &'a [f64],
-    k: usize,
+/// The number of labels whose best candidate is best.
+fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOptions) -> usize {
+    let value = |k: usize| {
+        let candidates = pool(shapes, criterion, k, options.seed);
+        let judge = Judge::new(criterion, candidates, &shapes.area, k);
+        judge.comparable_value()
+    };
+    let values = (2..=options.max_labels.max(2)).map(|k| (k, value(k)));
+    let best = values.reduce(|best, next| if next.1 > best.1 { next } else { best });
+    best.map_or(2, |(k, _)| k)
 }
 
-impl<'a> Judge<'a> {
-    fn new(criterion: &'a Criterion, candidates: Vec<Vec<u32>>, area: &'a [f64], k: usize) -> Self {
-        let scores: Vec<f64> = candidates
-            .iter()
-            .map(|l| criterion.score(&criterion.pair_sums(l, k)))
-            .collect();
-        let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let mut weights: Vec<f64> = scores
-            .iter()
-            .map(|s| ((s - top) / TEMPERATURE).exp())
-            .collect();
-        let sum: f64 = weights.iter().sum();
-        weights.iter_mut().for_each(|w| *w /= sum);
-        Self {
-            criterion,
-            candidates,
-            weights,
-            area,
-            k,
-        }
-    }
-
-    /// Score plus weighted consensus of each labelling of all patches, with labels below `k`.
-    fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
-        let consensus = self.consensus(labellings, k);
-        labellings
-            .iter()
-            .zip(consensus)
-            .map(|(l, c)| {
-                self.criterion.score(&self.criterion.pair_sums(l, k)) + CONSENSUS_WEIGHT * c
-            })
-            .collect()
-    }
-
-    /// For each labelling the mean normalised mutual information with the candidates; areas weigh the patches.
-    fn consensus(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
-        let (mine, theirs) = (
-            self.indicator(labellings, k),
-            self.indicator(&self.candidates, self.k),
-        );
-        let joint = mine.transpose() * &theirs;
-        let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
-        let own = |m: &DMatrix<f64>, c: usize, k: usize| -> f64 {
-            (0..k)
-                .map(|l| entropy(m.column(c * k + l).norm_squared()))
-                .sum()
-        };
-        let their_own: Vec<f64> = (0..self.candidates.len())
-            .map(|c| own(&theirs, c, self.k))
-            .collect();
-        (0..labellings.len())
-            .map(|a| {
-                let my_own = own(&mine, a, k);
-                let agreement = |b: usize| {
-                    let block = joint.view((a * k, b * self.k), (k, self.k));
-                    let both: f64 = block.iter().map(|p| entropy(*p)).sum();
-                    (my_own + their_own[b] - both) / (my_own * their_own[b]).sqrt().max(1e-9)
-                };
-                (0..self.candidates.len())
-                    .map(|b| self.weights[b] * agreement(b))
-                    .sum()
-            })
-            .collect()
-    }
-
-    /// Column `c k + l` holds the roots of the area shares of the patches that labelling c gives label l.
-    fn indicator(&self, labellings: &[Vec<u32>], k: usize) -> DMatrix<f64> {
-        let total: f64 = self.area.iter().sum();
-        let mut indicator = DMatrix::zeros(self.area.len(), labellings.len() * k);
-        for (c, labels) in labellings.iter().enumerate() {
-            for (p, l) in labels.iter().enumerate() {
-                indicator[(p, c * k + *l as usize)] = (self.area[p] / total).sqrt();
-            }
-        }
-        indicator
-    }
-}
-
-/// The best labelling with `k` labels: the best candidates are refined face by face, and judged again as what they
-/// became. `None` if there is no candidate.
+/// The best labelling with `k` labels. Candidates are refined patch by patch; from the best of them a metric is
+/// learnt, in which parts are grouped once more; the best of all are refined face by face, and judged again as
+/// what they became. `None` if there is no candidate.
 fn choose(
     shapes: &Prepared<'_>,
     criterion: &Criterion,
@@ -326,24 +251,54 @@ fn choose(
     seed: u64,
     current: Option<(&[Vec<u32>], usize)>,
 ) -> Option<Discovery> {
+    let patchwise = Patchwise::new(shapes);
     let candidates = pool(shapes, criterion, k, seed);
-    let judge = Judge::new(criterion, candidates, &shapes.area, k);
-    let values = judge.values(&judge.candidates, k);
-    let mut order: Vec<usize> = (0..values.len()).collect();
-    order.sort_by(|&a, &b| values[b].total_cmp(&values[a]).then(a.cmp(&b)));
-    let refined: Vec<Vec<Vec<u32>>> = order
-        .iter()
-        .take(SHORTLIST)
-        .map(|&c| refine(shapes.input, shapes.on_faces(&judge.candidates[c]), k))
+    let refined_all = |labellings: &[Vec<u32>]| -> Vec<Vec<u32>> {
+        labellings
+            .par_iter()
+            .map(|l| patchwise.refine(l, k))
+            .collect()
+    };
+    let mut refined = refined_all(&candidates);
+    let mut judge = Judge::new(criterion, candidates, &shapes.area, k);
+    let teachers = judge.best(&refined, N_TEACHERS);
+    let teachers: Vec<&Vec<u32>> = teachers.iter().map(|&c| &refined[c]).collect();
+    if let Some(metric) = patchwise.metric(&teachers, k) {
+        let features: Vec<Features> = shapes
+            .each()
+            .map(|s| in_metric(s.features, &metric))
+            .collect();
+        let input = DiscoveryInput {
+            shapes: shapes
+                .input
+                .shapes
+                .iter()
+                .zip(&features)
+                .map(|(s, features)| ShapeInput { features, ..*s })
+                .collect(),
+            up_known: shapes.up_known,
+        };
+        let in_metric = Prepared {
+            learnt_metric: true,
+            ..Prepared::new(&input)
+        };
+        let more = pool(&in_metric, criterion, k, seed);
+        refined.extend(refined_all(&more));
+        judge = judge.with_more(more);
+    }
+    let on_faces: Vec<Vec<Vec<u32>>> = judge
+        .best(&refined, SHORTLIST)
+        .into_par_iter()
+        .map(|c| refine(shapes.input, shapes.on_faces(&refined[c]), k))
         .collect();
-    let as_patches: Vec<Vec<u32>> = refined.iter().map(|l| shapes.majority(l, k)).collect();
+    let as_patches: Vec<Vec<u32>> = on_faces.iter().map(|l| shapes.majority(l, k)).collect();
     let values = judge.values(&as_patches, k);
     let best =
         (0..values.len()).max_by(|&a, &b| values[a].total_cmp(&values[b]).then(b.cmp(&a)))?;
     let current_value = current.map_or(f64::NEG_INFINITY, |(labels, n)| {
         judge.values(&[shapes.majority(labels, n)], n)[0]
     });
-    let labels = refined.into_iter().nth(best)?;
+    let labels = on_faces.into_iter().nth(best)?;
     Some(Discovery {
         labels,
         n_labels: k,

@@ -119,6 +119,32 @@ pub(super) fn embedding(graph: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f64>
     (values, vectors, degrees(graph))
 }
 
+/// The first `width` eigenvectors, rows scaled to length 1 (Ng, Jordan and Weiss 2001).
+pub(super) fn row_normalised(basis: &DMatrix<f64>, width: usize) -> Vec<f64> {
+    let mut out = Vec::with_capacity(basis.nrows() * width);
+    for row in basis.row_iter() {
+        let norm = row.columns(0, width).norm().max(1e-9);
+        out.extend(row.iter().take(width).map(|x| x / norm));
+    }
+    out
+}
+
+/// Diffusion coordinates after three steps, without the constant one (Coifman and Lafon 2006).
+pub(super) fn diffusion(
+    values: &[f64],
+    basis: &DMatrix<f64>,
+    degrees: &[f64],
+    width: usize,
+) -> Vec<f64> {
+    let mut out = Vec::with_capacity(basis.nrows() * (width - 1));
+    for (row, degree) in basis.row_iter().zip(degrees) {
+        out.extend(
+            (1..width).map(|c| row[c] / degree.sqrt().max(1e-12) * values[c].max(0.0).powi(3)),
+        );
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -4,6 +4,7 @@
 //! collection has learnt of its labels. [`cut`] turns per-face evidence into a labelling with short
 //! boundaries along concave creases.
 
+mod baselines;
 mod boundary;
 mod candidates;
 mod criterion;
@@ -11,10 +12,15 @@ pub mod cut;
 mod discover;
 mod features;
 mod joint;
+mod judge;
 mod model;
+mod patchwise;
 pub mod score;
+#[cfg(test)]
+mod test_shapes;
 mod up;
 
+pub use baselines::{Baseline, baseline};
 pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};

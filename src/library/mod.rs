@@ -49,7 +49,7 @@ mod types;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
-pub use place::{MAX_MAPS, MAX_REPRESENTATIVES};
+pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
 pub use types::{

@@ -288,7 +288,7 @@ impl Library {
 }
 
 /// Number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 39, 55, …
-pub(super) fn next_recluster(n_shapes: u64) -> u64 {
+pub fn next_recluster(n_shapes: u64) -> u64 {
     if n_shapes < TOO_FEW as u64 {
         return n_shapes + 1;
     }

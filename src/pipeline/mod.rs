@@ -13,6 +13,6 @@ pub use describe::{
 pub use exemplars::{Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach};
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
-    LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, recluster,
+    LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, batch, recluster,
 };
 pub use split::{split_faces, split_model};

@@ -3,14 +3,16 @@
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
-    Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation, ShapeInput,
-    Statistics, discover,
+    Baseline, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation,
+    ShapeInput, Statistics, baseline, discover,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
 
-/// A new labelling is taken only if its score is higher by this; so labels do not flicker.
-pub const MIN_GAIN: f64 = 0.03;
+/// A new labelling is taken only if its value is higher by this. Nothing: the labelling that is there competes with
+/// the new ones by the same measure on the same shapes, and each re-clustering sees many more shapes than the one
+/// before, so that a margin keeps what was found when there was less to go by.
+pub const MIN_GAIN: f64 = 0.0;
 
 /// A representative shape and the labels its faces carry now.
 #[derive(Debug, Clone, Copy)]
@@ -78,44 +80,14 @@ pub fn recluster(
     epoch: u64,
     options: &ReclusterOptions,
 ) -> Reclustering {
-    let raw: Vec<Features> = shapes
-        .iter()
-        .map(|s| Features::raw(&s.shape, options.up))
-        .collect();
-    let surfaces: Vec<Surface> = shapes
-        .iter()
-        .map(|s| Surface::new(&s.shape.mesh()))
-        .collect();
-    let normalisation = Normalisation::fit(
-        raw.iter().zip(surfaces.iter().map(|s| s.area.as_slice())),
-        options.up.is_some(),
-    );
-    let prepared: Vec<Prepared> = raw
-        .iter()
-        .zip(surfaces)
-        .map(|(raw, surface)| Prepared {
-            surface,
-            features: normalisation.standardise(raw),
-            at_vertices: Vec::new(),
-        })
-        .collect();
-    let patches: Vec<PatchGraph> = prepared
-        .iter()
-        .zip(shapes)
-        .map(|(p, s)| PatchGraph::new(&p.surface, s.shape.patches))
-        .collect();
-    let input = DiscoveryInput {
-        shapes: prepared
-            .iter()
-            .zip(&patches)
-            .map(|(p, patches)| ShapeInput {
-                surface: &p.surface,
-                patches,
-                features: &p.features,
-            })
-            .collect(),
-        up_known: options.up.is_some(),
-    };
+    let views: Vec<DescriptionView<'_>> = shapes.iter().map(|s| s.shape).collect();
+    let together = Together::new(&views, options.up);
+    let input = together.input();
+    let Together {
+        normalisation,
+        prepared,
+        ..
+    } = &together;
     let current = old.map(|model| current_classes(shapes, model));
     let there = current.as_deref().zip(old.map(|m| m.labels.len()));
     let found = discover(&input, &options.discovery, there);
@@ -126,7 +98,7 @@ pub fn recluster(
         (_, current, old) => rename(
             found,
             current.as_deref().zip(old),
-            &prepared,
+            prepared,
             options.next_label,
         ),
     };
@@ -140,13 +112,13 @@ pub fn recluster(
     let model = LabelModel {
         epoch,
         labels,
-        normalisation,
+        normalisation: normalisation.clone(),
         statistics,
         up: options.up,
     };
     let labellings = classes
         .into_iter()
-        .zip(&prepared)
+        .zip(prepared)
         .map(|(c, p)| Labelling::given(c, p, &model))
         .collect();
     Reclustering {
@@ -155,6 +127,78 @@ pub fn recluster(
         changes,
         model,
         labellings,
+    }
+}
+
+/// Shapes whose descriptors are standardised together.
+struct Together {
+    normalisation: Normalisation,
+    prepared: Vec<Prepared>,
+    patches: Vec<PatchGraph>,
+}
+
+impl Together {
+    fn new(shapes: &[DescriptionView<'_>], up: Option<[f64; 3]>) -> Self {
+        let raw: Vec<Features> = shapes.iter().map(|s| Features::raw(s, up)).collect();
+        let surfaces: Vec<Surface> = shapes.iter().map(|s| Surface::new(&s.mesh())).collect();
+        let normalisation = Normalisation::fit(
+            raw.iter().zip(surfaces.iter().map(|s| s.area.as_slice())),
+            up.is_some(),
+        );
+        let prepared: Vec<Prepared> = raw
+            .iter()
+            .zip(surfaces)
+            .map(|(raw, surface)| Prepared {
+                surface,
+                features: normalisation.standardise(raw),
+                at_vertices: Vec::new(),
+            })
+            .collect();
+        let patches = prepared
+            .iter()
+            .zip(shapes)
+            .map(|(p, s)| PatchGraph::new(&p.surface, s.patches))
+            .collect();
+        Self {
+            normalisation,
+            prepared,
+            patches,
+        }
+    }
+
+    fn input(&self) -> DiscoveryInput<'_> {
+        DiscoveryInput {
+            shapes: self
+                .prepared
+                .iter()
+                .zip(&self.patches)
+                .map(|(p, patches)| ShapeInput {
+                    surface: &p.surface,
+                    patches,
+                    features: &p.features,
+                })
+                .collect(),
+            up_known: self.normalisation.up_known,
+        }
+    }
+}
+
+/// Labels of the proxy faces of shapes that are all known from the start, by discovery or by a baseline.
+pub fn batch(
+    shapes: &[DescriptionView<'_>],
+    n_labels: usize,
+    up: Option<[f64; 3]>,
+    by: Option<Baseline>,
+) -> Vec<Vec<u32>> {
+    let together = Together::new(shapes, up);
+    let input = together.input();
+    let options = DiscoveryOptions {
+        n_labels: Some(n_labels),
+        ..DiscoveryOptions::default()
+    };
+    match by {
+        Some(which) => baseline(which, &input, n_labels, options.seed),
+        None => discover(&input, &options, None).labels,
     }
 }
 

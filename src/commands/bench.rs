@@ -1,0 +1,212 @@
+//! `coseg bench`: how good the product is on meshes whose parts are known.
+
+use super::bench_labels::{Category, Run};
+use super::demo::{DRAIN_LIMIT, Scratch, log_warnings, start};
+use super::session::{Session, print_line, table};
+use super::{CommandError, Outcome, bench_labels};
+use crate::cli::{Global, up};
+use clap::{Args, Subcommand};
+use coseg::ipc::wire;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+/// `coseg bench`
+#[derive(Debug, Subcommand)]
+pub(crate) enum Bench {
+    /// Label meshes with known parts, streamed one by one, and compare
+    Labels(BenchLabels),
+}
+
+/// `coseg bench labels`
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BenchLabels {
+    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with one integer a face
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Only these categories [default: all]
+    #[arg(long, value_name = "NAME")]
+    category: Vec<String>,
+    /// Orders of arrival: the first is that of the names, others are shuffled
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    orders: u32,
+    /// At most this many shapes of each category, the first by name
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    limit: Option<u32>,
+    /// The axis that points up in every file [default: unknown]
+    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+    up: Option<wire::Up>,
+    /// Let the daemon estimate the number of part kinds
+    #[arg(long)]
+    estimate: bool,
+    /// Only stream: no batch answer, no baselines (which see 60 shapes at most, spread evenly)
+    #[arg(long)]
+    no_baselines: bool,
+    /// Write the labels of the last order to DIR/CATEGORY/NAME.labels.txt
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+}
+
+/// Accuracies of one category.
+struct Row {
+    name: String,
+    n_shapes: usize,
+    n_parts: usize,
+    runs: Vec<Run>,
+    others: Vec<(&'static str, f64)>,
+}
+
+impl Row {
+    fn accuracies(&self) -> Vec<f64> {
+        self.runs.iter().map(|r| r.accuracy).collect()
+    }
+
+    fn spread(&self) -> f64 {
+        let a = self.accuracies();
+        let most = a.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        most - a.iter().copied().fold(f64::INFINITY, f64::min)
+    }
+}
+
+pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
+    let Bench::Labels(args) = bench;
+    let categories = bench_labels::categories(&args.data, &args.category, args.limit)?;
+    let up = args.up.unwrap_or(wire::Up::Unknown);
+    log_warnings()?;
+    let mut rows = Vec::new();
+    for category in &categories {
+        rows.push(row(args, category, up, global)?);
+        if let (Some(row), false) = (rows.last(), global.json) {
+            let runs: Vec<String> = row.accuracies().iter().map(|a| format!("{a:.3}")).collect();
+            eprintln!("{}: {}", row.name, runs.join(" "));
+        }
+    }
+    if global.json {
+        print_line(&report(&rows).to_string())?;
+    } else {
+        print_line(&table(&lines(&rows)))?;
+    }
+    Ok(rows.iter().flat_map(|r| &r.runs).all(|r| r.n_missing == 0))
+}
+
+/// Streams a category in every order, each through a daemon of its own on an empty library.
+fn row(
+    args: &BenchLabels,
+    category: &Category,
+    up: wire::Up,
+    global: &Global,
+) -> Result<Row, CommandError> {
+    let mut runs = Vec::new();
+    let mut others = Vec::new();
+    for order in 0..args.orders {
+        let scratch = Scratch::create()?;
+        let running = start(&scratch.0)?;
+        let global = Global {
+            endpoint: Some(running.endpoint().to_string()),
+            ..global.clone()
+        };
+        let mut session = Session::open(&global)?;
+        let n_parts = if args.estimate {
+            0
+        } else {
+            category.n_parts as u32
+        };
+        let run = bench_labels::stream(category, order, n_parts, up, &mut session);
+        drop(session);
+        running.drain(DRAIN_LIMIT);
+        runs.push(run?);
+        if order + 1 == args.orders {
+            if !args.no_baselines {
+                others = bench_labels::others(category, &scratch.0.join("library"))?;
+            }
+            if let (Some(out), Some(run)) = (&args.out, runs.last()) {
+                bench_labels::write(category, run, &out.join(&category.name))?;
+            }
+        }
+    }
+    Ok(Row {
+        name: category.name.clone(),
+        n_shapes: category.shapes.len(),
+        n_parts: category.n_parts,
+        runs,
+        others,
+    })
+}
+
+fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    values.clone().sum::<f64>() / values.count().max(1) as f64
+}
+
+/// The table: a line for each category, the mean last.
+fn lines(rows: &[Row]) -> Vec<Vec<String>> {
+    let mut head = ["category", "shapes", "parts", "found", "streamed", "spread"]
+        .map(str::to_owned)
+        .to_vec();
+    let others = rows.first().map_or(&[][..], |r| &r.others);
+    head.extend(others.iter().map(|o| o.0.to_owned()));
+    let mut lines = vec![head];
+    for r in rows {
+        let found = mean(r.runs.iter().map(|r| r.n_labels as f64));
+        let mut line = vec![
+            r.name.clone(),
+            r.n_shapes.to_string(),
+            r.n_parts.to_string(),
+            format!("{found:.1}"),
+            format!("{:.3}", mean(r.accuracies().into_iter())),
+            format!("{:.3}", r.spread()),
+        ];
+        line.extend(r.others.iter().map(|o| format!("{:.3}", o.1)));
+        lines.push(line);
+    }
+    let streamed = mean(rows.iter().map(|r| mean(r.accuracies().into_iter())));
+    let spread = mean(rows.iter().map(Row::spread));
+    let mut last = vec![
+        "mean".to_owned(),
+        String::new(),
+        String::new(),
+        String::new(),
+    ];
+    last.extend([format!("{streamed:.3}"), format!("{spread:.3}")]);
+    last.extend(
+        (0..others.len()).map(|i| format!("{:.3}", mean(rows.iter().map(|r| r.others[i].1)))),
+    );
+    lines.push(last);
+    lines
+}
+
+fn report(rows: &[Row]) -> Value {
+    let category = |r: &Row| {
+        let runs: Vec<Value> = r
+            .runs
+            .iter()
+            .map(|run| {
+                json!({
+                    "accuracy": run.accuracy,
+                    "purity": run.purity,
+                    "rand_error": run.rand_error,
+                    "n_labels": run.n_labels,
+                    "n_missing": run.n_missing,
+                    "seconds": run.seconds,
+                })
+            })
+            .collect();
+        let others: serde_json::Map<String, Value> = r
+            .others
+            .iter()
+            .map(|(name, accuracy)| ((*name).to_owned(), (*accuracy).into()))
+            .collect();
+        json!({
+            "category": r.name,
+            "n_shapes": r.n_shapes,
+            "n_parts": r.n_parts,
+            "accuracy": mean(r.accuracies().into_iter()),
+            "spread": r.spread(),
+            "orders": runs,
+            "others": others,
+        })
+    };
+    let accuracy = mean(rows.iter().map(|r| mean(r.accuracies().into_iter())));
+    json!({
+        "accuracy": accuracy,
+        "categories": rows.iter().map(category).collect::<Vec<_>>(),
+    })
+}

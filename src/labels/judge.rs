@@ -1,0 +1,158 @@
+//! Which of many candidate labellings is best, when nothing is known but the shapes.
+//!
+//! The value of a labelling is half the log of how concave its boundaries are plus how much it agrees with the
+//! other candidates, each counting by its score. The two err in different ways: a few very concave boundaries may
+//! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs.
+
+use super::criterion::{CONCAVITY_WEIGHT, Criterion};
+use nalgebra::DMatrix;
+
+/// Temperature of the scores when the candidates vote.
+const TEMPERATURE: f64 = 0.1;
+/// Weight of the consensus beside the score, when numbers of labels are compared.
+const CONSENSUS_WEIGHT: f64 = 0.5;
+
+/// Judges labellings by the criterion, and by how much they agree with what the good candidates agree on.
+pub(super) struct Judge<'a> {
+    criterion: &'a Criterion,
+    /// Candidate labellings of all patches, their scores, and the softmax of these.
+    candidates: Vec<Vec<u32>>,
+    scores: Vec<f64>,
+    weights: Vec<f64>,
+    area: &'a [f64],
+    k: usize,
+}
+
+impl<'a> Judge<'a> {
+    pub(super) fn new(
+        criterion: &'a Criterion,
+        candidates: Vec<Vec<u32>>,
+        area: &'a [f64],
+        k: usize,
+    ) -> Self {
+        let scores: Vec<f64> = candidates
+            .iter()
+            .map(|l| criterion.score(&criterion.pair_sums(l, k)))
+            .collect();
+        let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mut weights: Vec<f64> = scores
+            .iter()
+            .map(|s| ((s - top) / TEMPERATURE).exp())
+            .collect();
+        let sum: f64 = weights.iter().sum();
+        weights.iter_mut().for_each(|w| *w /= sum);
+        Self {
+            criterion,
+            candidates,
+            scores,
+            weights,
+            area,
+            k,
+        }
+    }
+
+    /// The judge who has heard `more` candidates.
+    pub(super) fn with_more(mut self, more: Vec<Vec<u32>>) -> Self {
+        self.candidates.extend(more);
+        Self::new(self.criterion, self.candidates, self.area, self.k)
+    }
+
+    /// Value of each labelling of all patches, with labels below `k`.
+    pub(super) fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
+        labellings
+            .iter()
+            .zip(self.consensus(labellings, k))
+            .map(|(l, c)| {
+                let sums = self.criterion.pair_sums(l, k);
+                CONCAVITY_WEIGHT * self.criterion.concavity(&sums).max(1e-3).ln() + c
+            })
+            .collect()
+    }
+
+    /// Positions of the `n` labellings of greatest value, best first.
+    pub(super) fn best(&self, labellings: &[Vec<u32>], n: usize) -> Vec<usize> {
+        let values = self.values(labellings, self.k);
+        let mut order: Vec<usize> = (0..values.len()).collect();
+        order.sort_by(|&a, &b| values[b].total_cmp(&values[a]).then(a.cmp(&b)));
+        order.truncate(n);
+        order
+    }
+
+    /// The best candidate's score plus consensus, which numbers of labels can be compared by.
+    pub(super) fn comparable_value(&self) -> f64 {
+        let consensus = self.consensus(&self.candidates, self.k);
+        let values = self.scores.iter().zip(consensus);
+        values
+            .map(|(s, c)| s + CONSENSUS_WEIGHT * c)
+            .fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// For each labelling the mean normalised mutual information with the candidates; areas weigh the patches.
+    fn consensus(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
+        let (mine, theirs) = (
+            self.indicator(labellings, k),
+            self.indicator(&self.candidates, self.k),
+        );
+        let joint = mine.transpose() * &theirs;
+        let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
+        let own = |m: &DMatrix<f64>, c: usize, k: usize| -> f64 {
+            (0..k)
+                .map(|l| entropy(m.column(c * k + l).norm_squared()))
+                .sum()
+        };
+        let their_own: Vec<f64> = (0..self.candidates.len())
+            .map(|c| own(&theirs, c, self.k))
+            .collect();
+        (0..labellings.len())
+            .map(|a| {
+                let my_own = own(&mine, a, k);
+                let agreement = |b: usize| {
+                    let block = joint.view((a * k, b * self.k), (k, self.k));
+                    let both: f64 = block.iter().map(|p| entropy(*p)).sum();
+                    (my_own + their_own[b] - both) / (my_own * their_own[b]).sqrt().max(1e-9)
+                };
+                (0..self.candidates.len())
+                    .map(|b| self.weights[b] * agreement(b))
+                    .sum()
+            })
+            .collect()
+    }
+
+    /// Column `c k + l` holds the roots of the area shares of the patches that labelling c gives label l.
+    fn indicator(&self, labellings: &[Vec<u32>], k: usize) -> DMatrix<f64> {
+        let total: f64 = self.area.iter().sum();
+        let mut indicator = DMatrix::zeros(self.area.len(), labellings.len() * k);
+        for (c, labels) in labellings.iter().enumerate() {
+            for (p, l) in labels.iter().enumerate() {
+                indicator[(p, c * k + *l as usize)] = (self.area[p] / total).sqrt();
+            }
+        }
+        indicator
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::discover::Prepared;
+    use super::super::test_shapes::Strips;
+    use super::*;
+
+    #[test]
+    fn labels_that_end_at_creases_and_recur_are_best() {
+        let strips = Strips::new(4, 3, 0.3);
+        let input = strips.input();
+        let shapes = Prepared::new(&input);
+        let criterion = shapes.criterion();
+        let truth: Vec<u32> = (0..4).flat_map(|_| (0..18).map(|p| p / 6)).collect();
+        let shifted: Vec<u32> = (0..4)
+            .flat_map(|_| (0..18).map(|p| (p + 2) / 6 % 3))
+            .collect();
+        let mut once = truth.clone();
+        once[..18].copy_from_slice(&shifted[..18]);
+        let candidates = vec![shifted.clone(), truth.clone(), once.clone()];
+        let judge = Judge::new(&criterion, candidates.clone(), &shapes.area, 3);
+        assert_eq!(judge.best(&candidates, 3), [1, 2, 0]);
+        let values = judge.values(&candidates, 3);
+        assert_eq!(values, judge.with_more(Vec::new()).values(&candidates, 3));
+    }
+}
