@@ -1,6 +1,7 @@
 //! Requests are sorted by what they need: reads run side by side, changes one after the other in order
 //! of arrival, waits hold no thread.
 
+use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
 use crate::daemon::{Daemon, blocking, reads, writes};
 use crate::ipc::convert;
@@ -126,7 +127,15 @@ async fn change_in_order(
         });
         let done = done.await;
         match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-            Ok(writes::Done::Now(result)) => in_hand.finish(&daemon, Ok((*result, Vec::new()))),
+            Ok(writes::Done::Now(result)) => {
+                let drain = matches!(*result, reply::Result::Drain(_));
+                in_hand.finish(&daemon, Ok((*result, Vec::new())));
+                if drain {
+                    // After the reply, which would else come too late for the sockets. An error
+                    // means that the main thread is gone: the daemon is ending already.
+                    let _ = daemon.asked_to_drain.send(Control::Drain);
+                }
+            }
             Ok(writes::Done::WhenPlaced(job)) => {
                 let daemon = Arc::clone(&daemon);
                 tokio::spawn(async move {

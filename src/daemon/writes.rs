@@ -4,7 +4,6 @@ use crate::config;
 use crate::daemon::Daemon;
 use crate::daemon::publish::Notice;
 use crate::daemon::requests::draining;
-use crate::daemon::service::Control;
 use crate::ipc::convert;
 use crate::ipc::endpoint::Endpoint;
 use crate::ipc::frames::FrameReader;
@@ -158,8 +157,6 @@ fn drain(daemon: &Daemon) -> Result<Reply, wire::Error> {
         ));
     }
     let n_queued = daemon.work.progress().n_live(None) as u64;
-    // The main thread is gone: the daemon is ending already.
-    let _ = daemon.asked_to_drain.send(Control::Drain);
     Ok(Reply::Drain(wire::DrainReply { n_queued }))
 }
 
