@@ -7,7 +7,6 @@ use super::session::{Session, ambiguous, bar};
 use super::{CommandError, Outcome, json};
 use crate::cli::Add;
 use bytes::Bytes;
-use coseg::call;
 use coseg::ipc::client::unexpected;
 use coseg::ipc::wire::{self, ItemState, reply, request, shape_input::Source};
 use coseg::mesh::Format;
@@ -178,15 +177,7 @@ fn finish_job(
     };
     let (mut revision, mut n_reported) = (0, 0);
     loop {
-        let request = wire::WatchJobRequest {
-            job_id,
-            revision,
-            wait_ms: session.wait_ms(),
-        };
-        let job = call!(session.client, WatchJob(request))?
-            .job
-            .unwrap_or_default();
-        revision = job.revision;
+        let job = session.watch_job(job_id, &mut revision)?;
         for item in job.items.iter().skip(n_reported) {
             match item.state() {
                 ItemState::Done | ItemState::Failed | ItemState::Cancelled => {

@@ -5,7 +5,6 @@ use super::session::Session;
 use super::{CommandError, labels};
 use crate::cli::Settings;
 use bytes::Bytes;
-use coseg::call;
 use coseg::ipc::client::unexpected;
 use coseg::ipc::wire::{self, reply, request, shape_input::Source};
 use coseg::labels::score::{Score, ScoredShape, score};
@@ -259,20 +258,8 @@ pub(crate) fn stream(
 
 fn wait(job_id: u64, session: &mut Session) -> Result<(), CommandError> {
     let mut revision = 0;
-    loop {
-        let request = wire::WatchJobRequest {
-            job_id,
-            revision,
-            wait_ms: session.wait_ms(),
-        };
-        let job = call!(session.client, WatchJob(request))?
-            .job
-            .unwrap_or_default();
-        revision = job.revision;
-        if job.finished {
-            return Ok(());
-        }
-    }
+    while !session.watch_job(job_id, &mut revision)?.finished {}
+    Ok(())
 }
 
 /// Writes the labels of a run, one file a shape.

@@ -9,7 +9,6 @@ use crate::cli::{Global, Settings};
 use crate::telemetry;
 use bytes::Bytes;
 use clap::Args;
-use coseg::call;
 use coseg::config::{Config, Log};
 use coseg::daemon::{self, Running, ServeError};
 use coseg::ipc::client::unexpected;
@@ -225,15 +224,7 @@ fn add(
     };
     let mut revision = 0;
     loop {
-        let request = wire::WatchJobRequest {
-            job_id,
-            revision,
-            wait_ms: session.wait_ms(),
-        };
-        let job = call!(session.client, WatchJob(request))?
-            .job
-            .unwrap_or_default();
-        revision = job.revision;
+        let job = session.watch_job(job_id, &mut revision)?;
         if job.finished {
             let item = job.items.into_iter().next();
             return item.ok_or_else(|| CommandError::Failed(format!("job {job_id} has no shapes")));

@@ -40,6 +40,24 @@ impl Session {
         u64::try_from(wait.as_millis()).unwrap_or(u64::MAX)
     }
 
+    /// A job once it has changed after `revision`, which becomes that of the answer, or when some time has passed.
+    pub(crate) fn watch_job(
+        &mut self,
+        job_id: u64,
+        revision: &mut u64,
+    ) -> Result<wire::Job, CommandError> {
+        let request = wire::WatchJobRequest {
+            job_id,
+            revision: *revision,
+            wait_ms: self.wait_ms(),
+        };
+        let job = call!(self.client, WatchJob(request))?
+            .job
+            .unwrap_or_default();
+        *revision = job.revision;
+        Ok(job)
+    }
+
     /// The collection that was named, or the only one there is.
     pub(crate) fn collection(&mut self, within: &InCollection) -> Result<String, CommandError> {
         if let Some(name) = &within.collection {

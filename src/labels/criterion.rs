@@ -11,7 +11,7 @@ use crate::segmentation::PatchGraph;
 use sprs::CsMat;
 
 /// Weight of the log of the concavity, in the score and in the value of a labelling.
-pub(super) const CONCAVITY_WEIGHT: f64 = 0.5;
+const CONCAVITY_WEIGHT: f64 = 0.5;
 /// Share of the intra-shape graph in the joint patch graph.
 const ALPHA: f64 = 0.5;
 /// Crease at which the affinity of touching patches has fallen to 1/e.
@@ -95,11 +95,12 @@ impl Criterion {
         sums
     }
 
-    /// How concave the boundaries between labels are: length-weighted mean crease relative to that of all patch
-    /// boundaries.
-    pub(super) fn concavity(&self, sums: &PairSums) -> f64 {
+    /// What the concavity of the boundaries between labels is worth: its weighted log; the concavity is their
+    /// length-weighted mean crease relative to that of all patch boundaries.
+    pub(super) fn concavity_value(&self, sums: &PairSums) -> f64 {
         let boundary = sums.between(&sums.creased) / sums.between(&sums.length).max(1e-9);
-        boundary / self.mean_crease.max(1e-300)
+        let concavity = boundary / self.mean_crease.max(1e-300);
+        CONCAVITY_WEIGHT * concavity.max(1e-3).ln()
     }
 
     /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
@@ -112,7 +113,7 @@ impl Criterion {
                 sums.affinity[l * k + l] / total - (volume / total).powi(2)
             })
             .sum();
-        CONCAVITY_WEIGHT * self.concavity(sums).max(1e-3).ln() + modularity.max(1e-6).ln()
+        self.concavity_value(sums) + modularity.max(1e-6).ln()
     }
 }
 

@@ -4,7 +4,7 @@
 //! other candidates, each counting by its score. The two err in different ways: a few very concave boundaries may
 //! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs.
 
-use super::criterion::{CONCAVITY_WEIGHT, Criterion};
+use super::criterion::Criterion;
 use nalgebra::DMatrix;
 
 /// Temperature of the scores when the candidates vote.
@@ -64,7 +64,7 @@ impl<'a> Judge<'a> {
             .zip(self.consensus(labellings, k))
             .map(|(l, c)| {
                 let sums = self.criterion.pair_sums(l, k);
-                CONCAVITY_WEIGHT * self.criterion.concavity(&sums).max(1e-3).ln() + c
+                self.criterion.concavity_value(&sums) + c
             })
             .collect()
     }

@@ -2,10 +2,10 @@
 //! maps and from what was learnt, which stays as it is until the next correction. Each shape ends with a commit.
 
 use super::commit::{collection_row, map_row, put_relabelled};
-use super::correct::{area_shares, pin_polygons};
+use super::correct::pin_polygons;
 use super::lane::Lane;
 use super::place::{Known, MAX_MAPS, Plan, next_recluster, sources_of};
-use super::relabel::{NewLabels, Relabelled, cause, moves};
+use super::relabel::{Relabelled, area_shares, cause};
 use super::rows::{Teaching, quality_from_json};
 use super::{LabelId, Library, Result, Source};
 use crate::fmap::{FunctionalMap, MapOptions};
@@ -253,27 +253,13 @@ impl Library {
         labels: &[LabelId],
         pins: &[i32],
     ) -> Result<Relabelled> {
-        let view = known.mapped.view();
-        let original = || self.original_bytes(&known.row.content_digest);
-        let mut new: NewLabels =
-            self.finish_labels(&view, labelling, labels, (&original, &known.row.format))?;
+        let mut new = self.finish_known(known, labelling, labels)?;
         if !pins.is_empty() {
             pin_polygons(&mut new.row, pins);
+            let view = known.mapped.view();
             new.summary.area_shares = area_shares(&view, &new.row.polygon_labels);
         }
-        new.row.version = known.row.version + 1;
-        let moves = moves(
-            &known.labels.polygon_labels,
-            &new.row.polygon_labels,
-            view.polygon_area,
-        );
-        Ok(Relabelled {
-            shape: known.row.id,
-            name: known.row.name.clone(),
-            labels: new,
-            moves,
-            cause: cause::CARRYING,
-        })
+        Ok(Relabelled::new(known, new, cause::CARRYING))
     }
 }
 

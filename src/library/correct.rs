@@ -4,7 +4,7 @@ use super::commit::{collection_row, event};
 use super::history::{Before, from_reply};
 use super::lane::Lane;
 use super::place::Known;
-use super::relabel::{NewLabels, cause, moves};
+use super::relabel::{NewLabels, area_shares, cause, face_ids, moves};
 use super::rows::{Teaching, damaged, label_colour, to_json};
 use super::{
     EventKind, FailureSubject, LabelId, Library, LibraryError, PartInfo, RequestKey, Result,
@@ -14,7 +14,7 @@ use crate::pipeline::{DescriptionView, proxy_pins};
 use crate::segmentation::Surface;
 use crate::store::{Digest, LabelRow, LabelSummary, LabelVersionRow, Tx};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// Largest label id that a person can choose.
 pub const MAX_LABEL: u32 = 65_535;
@@ -312,12 +312,7 @@ fn polygon_labels(
         }
         Correction::Part { part, label } => {
             let label = in_range(*label)?;
-            let ids: Vec<u32> = known
-                .labels
-                .proxy_labels
-                .iter()
-                .map(|l| *l as u32)
-                .collect();
+            let ids = face_ids(&known.labels.proxy_labels);
             let pieces = parts(&Surface::new(&view.mesh()), &ids);
             let Some(id) = pieces.label.get(*part as usize) else {
                 let n = pieces.label.len();
@@ -382,8 +377,7 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
     }
     pin_polygons(&mut row, pins);
     let surface = Surface::new(&view.mesh());
-    let ids: Vec<u32> = row.proxy_labels.iter().map(|l| *l as u32).collect();
-    let pieces = parts(&surface, &ids);
+    let pieces = parts(&surface, &face_ids(&row.proxy_labels));
     let infos: Vec<PartInfo> = pieces
         .label
         .iter()
@@ -414,15 +408,4 @@ pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
             *confidence = u8::MAX;
         }
     }
-}
-
-/// Share of the area that each label covers.
-pub(super) fn area_shares(view: &DescriptionView<'_>, labels: &[i32]) -> Vec<(LabelId, f64)> {
-    let mut shares = BTreeMap::<LabelId, f64>::new();
-    for (label, area) in labels.iter().zip(view.polygon_area) {
-        if let Ok(label) = u32::try_from(*label) {
-            *shares.entry(label).or_default() += f64::from(*area);
-        }
-    }
-    shares.into_iter().collect()
 }

@@ -2,16 +2,14 @@
 
 use super::collections::find_label;
 use super::commit::{collection_row, event, put_relabelled};
-use super::correct::area_shares;
 use super::history::{Before, from_reply};
 use super::lane::Lane;
 use super::learnt::Learnt;
 use super::place::Known;
-use super::relabel::{NewLabels, Relabelled, cause, moves};
+use super::relabel::{NewLabels, Relabelled, area_shares, cause, face_ids, part_infos};
 use super::rows::{CollectionState, label_colour, to_json};
 use super::teach::pupils;
-use super::{EventKind, LabelId, LabelInfo, Library, LibraryError, PartInfo, RequestKey, Result};
-use crate::correspondence::parts;
+use super::{EventKind, LabelId, LabelInfo, Library, LibraryError, RequestKey, Result};
 use crate::labels::LabelModel;
 use crate::pipeline::{Prepared, split_faces, split_model};
 use crate::segmentation::Surface;
@@ -331,26 +329,13 @@ fn put_changes(
 /// A new version of a shape's labels with other ids.
 fn renamed_labels(known: &Known, renamed: Renamed, cause: &'static str) -> Relabelled {
     let view = known.mapped.view();
-    let ids: Vec<u32> = renamed.proxy_labels.iter().map(|l| *l as u32).collect();
     let surface = Surface::new(&view.mesh());
-    let pieces = parts(&surface, &ids);
-    let n = renamed.proxy_labels.len();
-    let k = renamed.proxy_probabilities.len() / n.max(1);
-    let mut confidence = vec![0.0; pieces.label.len()];
-    for (f, part) in pieces.part_of_face.iter().enumerate() {
+    let k = renamed.proxy_probabilities.len() / renamed.proxy_labels.len().max(1);
+    let infos = part_infos(&surface, &face_ids(&renamed.proxy_labels), |f| {
         let row = &renamed.proxy_probabilities[f * k..(f + 1) * k];
-        let top = row.iter().copied().max().unwrap_or(0);
-        confidence[*part as usize] += surface.area[f] * f64::from(top) / 255.0;
-    }
-    let infos: Vec<PartInfo> = (0..pieces.label.len())
-        .map(|p| PartInfo {
-            label: pieces.label[p],
-            area_share: pieces.area[p],
-            confidence: confidence[p] / pieces.area[p].max(1e-300),
-        })
-        .collect();
+        f64::from(row.iter().copied().max().unwrap_or(0)) / 255.0
+    });
     let row = LabelVersionRow {
-        version: known.row.version + 1,
         proxy_labels: renamed.proxy_labels,
         proxy_probabilities: renamed.proxy_probabilities,
         polygon_labels: renamed.polygon_labels,
@@ -362,18 +347,7 @@ fn renamed_labels(known: &Known, renamed: Renamed, cause: &'static str) -> Relab
         parts_json: to_json(&infos),
         area_shares: area_shares(&view, &row.polygon_labels),
     };
-    let moved = moves(
-        &known.labels.polygon_labels,
-        &row.polygon_labels,
-        view.polygon_area,
-    );
-    Relabelled {
-        shape: known.row.id,
-        name: known.row.name.clone(),
-        labels: NewLabels { row, summary },
-        moves: moved,
-        cause,
-    }
+    Relabelled::new(known, NewLabels { row, summary }, cause)
 }
 
 /// Probabilities `(m, k + 1)` in which the faces of the new last class have what their old one had.

@@ -3,6 +3,7 @@
 use super::commit::Commit;
 use super::lane::{KnownShape, Lane};
 use super::learnt::Learnt;
+use super::relabel::face_ids;
 use super::rows::{CollectionState, damaged};
 use super::{Described, Library, Outcome, Placed, Result, Source, Up};
 use crate::fmap::{FunctionalMap, MapOptions};
@@ -202,7 +203,7 @@ impl Library {
         let new_ids = labelling.as_ref().map(ids).unwrap_or_default();
         let known_ids: Vec<Vec<u32>> = known
             .iter()
-            .map(|k| k.labels.proxy_labels.iter().map(|l| *l as u32).collect())
+            .map(|k| face_ids(&k.labels.proxy_labels))
             .collect();
         let mut shapes: Vec<Representative<'_>> = known
             .iter()

@@ -1,5 +1,6 @@
 //! What the library says: shapes, labels, arrays, maps, events.
 
+use super::relabel::face_ids;
 use super::rows::{
     damaged, format_from_name, from_json, quality_from_json, report_from_json, to_json,
 };
@@ -143,13 +144,7 @@ impl Library {
             let known = self.known(self.shape_row(collection, name)?.1.id)?;
             let view = known.mapped.view();
             let surface = Surface::new(&view.mesh());
-            let ids: Vec<u32> = known
-                .labels
-                .proxy_labels
-                .iter()
-                .map(|l| *l as u32)
-                .collect();
-            let pieces = parts(&surface, &ids);
+            let pieces = parts(&surface, &face_ids(&known.labels.proxy_labels));
             let n = view.vertices.len();
             let of_vertex = part_of_vertex(&pieces, n, view.faces, &surface.area);
             Ok((pieces.label, of_vertex, view.mass.to_vec()))

@@ -28,6 +28,25 @@ pub(super) struct Relabelled {
     pub(super) cause: &'static str,
 }
 
+impl Relabelled {
+    /// What changes when a stored shape gets these labels, as its next version.
+    pub(super) fn new(known: &Known, mut labels: NewLabels, cause: &'static str) -> Self {
+        labels.row.version = known.row.version + 1;
+        let moves = moves(
+            &known.labels.polygon_labels,
+            &labels.row.polygon_labels,
+            known.mapped.view().polygon_area,
+        );
+        Self {
+            shape: known.row.id,
+            name: known.row.name.clone(),
+            labels,
+            moves,
+            cause,
+        }
+    }
+}
+
 /// Causes of new labels of stored shapes.
 pub(super) mod cause {
     pub(crate) const RECLUSTERING: &str = "reclustering";
@@ -56,41 +75,33 @@ impl Library {
         let probability = |proxy_face: usize, class: u32| {
             f64::from(labelling.probabilities[proxy_face * k + class as usize]) / 255.0
         };
-        let mut shares = BTreeMap::<LabelId, f64>::new();
-        let mut confidence = Vec::with_capacity(class_of_polygon.len());
-        for (p, class) in class_of_polygon.iter().enumerate() {
-            *shares.entry(ids[*class as usize]).or_default() += f64::from(view.polygon_area[p]);
-            let c = labelling.probabilities[view.face_map[p] as usize * k + *class as usize];
-            confidence.push(c);
-        }
+        let confidence = class_of_polygon
+            .iter()
+            .zip(view.face_map)
+            .map(|(class, f)| labelling.probabilities[*f as usize * k + *class as usize])
+            .collect();
         // Two classes may be one label, after labels were merged.
         let ids_of_face: Vec<u32> = labelling.classes.iter().map(|c| ids[*c as usize]).collect();
-        let pieces = parts(&surface, &ids_of_face);
-        let mut confident_area = vec![0.0; pieces.label.len()];
-        for (f, part) in pieces.part_of_face.iter().enumerate() {
-            confident_area[*part as usize] +=
-                surface.area[f] * probability(f, labelling.classes[f]);
-        }
-        let infos: Vec<PartInfo> = (0..pieces.label.len())
-            .map(|p| PartInfo {
-                label: pieces.label[p],
-                area_share: pieces.area[p],
-                confidence: confident_area[p] / pieces.area[p].max(1e-300),
-            })
-            .collect();
-        let to_ids = |classes: &[u32]| classes.iter().map(|c| ids[*c as usize] as i32).collect();
+        let infos = part_infos(&surface, &ids_of_face, |f| {
+            probability(f, labelling.classes[f])
+        });
+        let to_ids = |classes: &[u32]| -> Vec<i32> {
+            classes.iter().map(|c| ids[*c as usize] as i32).collect()
+        };
+        let polygon_labels = to_ids(&class_of_polygon);
+        let area_shares = area_shares(view, &polygon_labels);
         Ok(NewLabels {
             row: LabelVersionRow {
                 proxy_labels: to_ids(&labelling.classes),
                 proxy_probabilities: labelling.probabilities.clone(),
-                polygon_labels: to_ids(&class_of_polygon),
+                polygon_labels,
                 polygon_confidence: confidence,
                 ..LabelVersionRow::default()
             },
             summary: LabelSummary {
                 label_epoch: 0,
                 parts_json: to_json(&infos),
-                area_shares: shares.into_iter().collect(),
+                area_shares,
             },
         })
     }
@@ -111,23 +122,20 @@ impl Library {
         labelling: &Labelling,
         ids: &[LabelId],
     ) -> Result<Relabelled> {
-        let view = known.mapped.view();
+        let labels = self.finish_known(known, labelling, ids)?;
+        Ok(Relabelled::new(known, labels, cause::RECLUSTERING))
+    }
+
+    /// [`Library::finish_labels`] of a stored shape.
+    pub(super) fn finish_known(
+        &self,
+        known: &Known,
+        labelling: &Labelling,
+        ids: &[LabelId],
+    ) -> Result<NewLabels> {
         let original = || self.original_bytes(&known.row.content_digest);
-        let mut labels =
-            self.finish_labels(&view, labelling, ids, (&original, &known.row.format))?;
-        labels.row.version = known.row.version + 1;
-        let moves = moves(
-            &known.labels.polygon_labels,
-            &labels.row.polygon_labels,
-            view.polygon_area,
-        );
-        Ok(Relabelled {
-            shape: known.row.id,
-            name: known.row.name.clone(),
-            labels,
-            moves,
-            cause: cause::RECLUSTERING,
-        })
+        let original: Original<'_> = (&original, &known.row.format);
+        self.finish_labels(&known.mapped.view(), labelling, ids, original)
     }
 
     /// Labels a stale shape anew from kept maps and the model its epoch began with: a vote and a cut. Whether it was
@@ -180,6 +188,42 @@ impl Library {
         lane.shapes[at].stale = false;
         Ok(true)
     }
+}
+
+/// Share of the area that each label covers.
+pub(super) fn area_shares(view: &DescriptionView<'_>, labels: &[i32]) -> Vec<(LabelId, f64)> {
+    let mut shares = BTreeMap::<LabelId, f64>::new();
+    for (label, area) in labels.iter().zip(view.polygon_area) {
+        if let Ok(label) = u32::try_from(*label) {
+            *shares.entry(label).or_default() += f64::from(*area);
+        }
+    }
+    shares.into_iter().collect()
+}
+
+/// The label ids of faces all of which have one.
+pub(super) fn face_ids(labels: &[i32]) -> Vec<LabelId> {
+    labels.iter().map(|l| *l as LabelId).collect()
+}
+
+/// The parts that the labels of proxy faces make; `confidence` is that of a face, from 0 to 1.
+pub(super) fn part_infos(
+    surface: &Surface,
+    ids: &[LabelId],
+    confidence: impl Fn(usize) -> f64,
+) -> Vec<PartInfo> {
+    let pieces = parts(surface, ids);
+    let mut confident_area = vec![0.0; pieces.label.len()];
+    for (f, part) in pieces.part_of_face.iter().enumerate() {
+        confident_area[*part as usize] += surface.area[f] * confidence(f);
+    }
+    (0..pieces.label.len())
+        .map(|p| PartInfo {
+            label: pieces.label[p],
+            area_share: pieces.area[p],
+            confidence: confident_area[p] / pieces.area[p].max(1e-300),
+        })
+        .collect()
 }
 
 /// Class of each polygon: that of its proxy face, with boundaries refined where the input is finer than the proxy.

@@ -198,11 +198,13 @@ impl Basis {
                 arch.dispatch(AddCombination { v, tiles, w });
             }
         };
-        let mut rows: Vec<_> = panels.map(|p| p.chunks_exact_mut(CHUNK)).into();
+        let mut rows = panels.map(|p| p.chunks_exact_mut(CHUNK));
         let chunks = (0..self.n_chunks).map(|c| {
-            let w: Vec<&mut [Row]> = rows.iter_mut().filter_map(Iterator::next).collect();
-            let w = w.try_into();
-            (c, w.expect("invariant: every panel has the basis' chunks"))
+            let w = rows.each_mut().map(Iterator::next);
+            (
+                c,
+                w.map(|w| w.expect("invariant: every panel has the basis' chunks")),
+            )
         });
         if self.parallel {
             let chunks: Vec<_> = chunks.collect();
