@@ -1,8 +1,10 @@
 //! What was typed becomes one command with typed flags.
 
 mod corrections;
+mod looking;
 
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+pub(crate) use looking::{Top, View};
 
 use crate::commands::bench::Bench;
 use crate::commands::demo::DemoArgs;
@@ -63,7 +65,7 @@ pub(crate) struct Global {
     pub(crate) json: bool,
 }
 
-fn seconds(text: &str) -> Result<Duration, String> {
+pub(crate) fn seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text
         .parse()
         .map_err(|_| format!("{text:?} is not a number of seconds"))?;
@@ -92,6 +94,8 @@ pub(crate) enum Command {
     Export(Export),
     /// Draw a collection in the colours of its labels, as one PNG
     Render(Render),
+    /// Write the viewer with a collection as one HTML file, which needs nothing else
+    View(View),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
     /// List the shapes most like one shape
@@ -119,6 +123,8 @@ pub(crate) enum Command {
     Collections(Collections),
     /// Show counters of the daemon
     Stats,
+    /// Follow queue, rates and stages of the daemon, as they change
+    Top(Top),
     /// Let the daemon finish what it is at and stop
     Stop,
     /// Compute the spectrum and descriptors of one mesh, without a daemon
@@ -135,6 +141,17 @@ pub(crate) enum Command {
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
+    /// Print the completions of a shell
+    Completions {
+        /// For which shell
+        shell: clap_complete::Shell,
+    },
+    /// Print the manual page, or write one for each command
+    Man {
+        /// Folder to write all pages to, created if missing
+        #[arg(long, value_name = "DIR")]
+        out: Option<PathBuf>,
+    },
 }
 
 /// `coseg serve`
@@ -145,6 +162,9 @@ pub(crate) struct Serve {
     pub(crate) library: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) file: ConfigFile,
+    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
+    #[arg(long, value_name = "HOST:PORT")]
+    pub(crate) http: Option<String>,
     /// Threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,

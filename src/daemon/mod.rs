@@ -5,7 +5,9 @@
 //! [`work`] describes and places accepted shapes; [`publish`] sends what the event log gained.
 //! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
 
+mod http;
 mod memory;
+mod metrics;
 mod progress;
 mod publish;
 mod reads;
@@ -23,6 +25,7 @@ use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
+use metrics::Metrics;
 use progress::Waiting;
 use publish::Notice;
 use sockets::Outbox;
@@ -56,6 +59,11 @@ pub enum StartError {
         endpoint: String,
         source: zmq::Error,
     },
+    #[error("http.listen {address}: {source}")]
+    Http {
+        address: std::net::SocketAddr,
+        source: std::io::Error,
+    },
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -68,7 +76,9 @@ impl StartError {
             Self::Endpoint(e) => {
                 !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
             }
-            Self::Library { .. } | Self::Socket { .. } | Self::Threads(_) => false,
+            Self::Library { .. } | Self::Socket { .. } | Self::Http { .. } | Self::Threads(_) => {
+                false
+            }
         }
     }
 }
@@ -90,6 +100,9 @@ struct Daemon {
     instance: String,
     started: Instant,
     counters: Arc<Counters>,
+    metrics: Arc<Metrics>,
+    /// Where the viewer is served, if it is.
+    http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
     describe_memory: Arc<Budget>,
     /// A permit for each thread that may describe.
@@ -161,6 +174,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     };
     // First the socket: a second daemon should hear of the first, not of its library's lock.
     let bound = sockets::bind(&endpoint, &config.limits)?;
+    let address = config.http.address()?;
+    let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
     let opened = |source| StartError::Library {
         path: directory.display().to_string(),
@@ -185,6 +200,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         instance: instance(),
         started: Instant::now(),
         counters: Arc::default(),
+        metrics: Arc::new(Metrics::new()),
+        http: listener.as_ref().and_then(|l| l.local_addr().ok()),
         request_memory: Budget::new(config.limits.request_bytes()),
         describe_memory: Budget::new(config.limits.describe_bytes()),
         workers: Arc::new(Semaphore::new(n_workers)),
@@ -201,6 +218,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("coseg")
+        .enable_io()
         .enable_time()
         .build()?;
     let socket_tick = Arc::new(AtomicU64::new(0));
@@ -223,10 +241,17 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
     tokio::spawn(sweep(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
+    if let Some(listener) = listener {
+        let listener = tokio::net::TcpListener::from_std(listener)?;
+        let server = http::Server::new(Arc::clone(&daemon), requests_in.clone());
+        tokio::spawn(server.watch(Arc::clone(&socket_tick)));
+        tokio::spawn(http::serve(server, listener));
+    }
     drop(guard);
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
         counters: Arc::clone(&daemon.counters),
+        metrics: Arc::clone(&daemon.metrics),
         tick: Arc::clone(&socket_tick),
         max_message_bytes: daemon.config().limits.max_message.0,
     };
@@ -262,7 +287,10 @@ async fn sweep(daemon: Arc<Daemon>) {
         match swept {
             Ok(Ok(files)) if files.is_empty() => {}
             Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
-            Ok(Err(e)) => tracing::warn!(error = %e, "orphaned files cannot be removed"),
+            Ok(Err(e)) => {
+                daemon.metrics.fault("sweep");
+                tracing::warn!(error = %e, "orphaned files cannot be removed");
+            }
             Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
         }
     }
@@ -286,6 +314,11 @@ impl Running {
     /// Where events are published.
     pub fn events(&self) -> &Endpoint {
         &self.daemon.events
+    }
+
+    /// Where the viewer is served, if it is.
+    pub fn http(&self) -> Option<std::net::SocketAddr> {
+        self.daemon.http
     }
 
     /// Takes over the settings that can change while the daemon runs; the names of the others that differ
@@ -317,6 +350,7 @@ impl Running {
                 "server.library",
                 new.server.library != config.server.library,
             ),
+            ("http", new.http != config.http),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
             (

@@ -2,7 +2,7 @@
 //! of arrival, waits hold no thread.
 
 use crate::daemon::service::Control;
-use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
+use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
 use crate::daemon::{Daemon, blocking, reads, writes};
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
@@ -40,7 +40,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
         let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
             let error = busy("too many requests are in hand");
             daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let Some(body) = incoming.request.body.take() else {
@@ -49,7 +49,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
                 ErrorReason::UnknownRequest,
                 "the request has no body that this version knows",
             );
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let in_hand = InHand { incoming, permit };
@@ -91,6 +91,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetFunctionalMap(_)
             | Body::GetPartCorrespondence(_)
             | Body::Nearest(_)
+            | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let readers = Arc::clone(&readers);
@@ -154,7 +155,11 @@ async fn change_in_order(
 impl InHand {
     /// Sends the reply and gives back the permit.
     fn finish(self, daemon: &Daemon, answer: Answer) {
-        daemon.answer(self.incoming.peer, self.incoming.request.request_id, answer);
+        daemon.answer(
+            self.incoming.reply_to,
+            self.incoming.request.request_id,
+            answer,
+        );
         drop(self.permit);
     }
 
@@ -205,16 +210,23 @@ impl InHand {
 }
 
 impl Daemon {
-    fn answer(&self, peer: Peer, request_id: String, answer: Answer) {
-        let (result, frames) = match answer {
-            Ok((result, frames)) => (result, frames),
-            Err(error) => {
-                if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
-                    tracing::error!(request_id, message = error.message, "a request failed");
-                }
-                (reply::Result::Error(error), Vec::new())
+    fn answer(&self, reply_to: ReplyTo, request_id: String, answer: Answer) {
+        if let Err(error) = &answer {
+            self.metrics.refused(error);
+            if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
+                tracing::error!(request_id, message = error.message, "a request failed");
+            }
+        }
+        let peer = match reply_to {
+            ReplyTo::Peer(peer) => peer,
+            ReplyTo::Task(task) => {
+                // Whoever asked may have stopped waiting.
+                let _ = task.send(answer);
+                return;
             }
         };
+        let (result, frames) =
+            answer.unwrap_or_else(|error| (reply::Result::Error(error), Vec::new()));
         self.outbox.reply(
             peer,
             Reply {
@@ -250,7 +262,7 @@ impl Daemon {
     }
 }
 
-fn busy(message: &str) -> wire::Error {
+pub(crate) fn busy(message: &str) -> wire::Error {
     let mut error = convert::error(
         ErrorCode::ResourceExhausted,
         ErrorReason::QueueFull,

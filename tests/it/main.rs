@@ -10,3 +10,4 @@ mod pipeline;
 mod spectra;
 mod store;
 mod tidy;
+mod viewing;
