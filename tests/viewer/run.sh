@@ -54,6 +54,6 @@ done
 "$coseg" synth candelabra --count 6 --faces 3000 --out "$work/candelabras" >/dev/null
 "$coseg" add "$work/chairs" --collection chairs --parts 4 --up +y --timeout 60 >/dev/null
 "$coseg" add "$work/candelabras" --collection candelabras --parts 3 --up +y --timeout 60 >/dev/null
-"$coseg" view chairs -o "$work/chairs.html"
+"$coseg" view chairs -o "$work/chairs.html" --timeout 60
 
 (cd "$work" && COSEG_BIN="$coseg" node viewer.mjs all "$url" "$out" "$work/chairs.html")

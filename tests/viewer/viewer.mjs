@@ -9,7 +9,7 @@ import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
 
 const [what, url, out, file] = process.argv.slice(2);
-const coseg = (...args) => JSON.parse(execFileSync(process.env.COSEG_BIN, [...args, "--json"], { encoding: "utf8" }));
+const coseg = (...args) => JSON.parse(execFileSync(process.env.COSEG_BIN, [...args, "--json", "--timeout", "60"], { encoding: "utf8" }));
 
 const browser = await chromium.launch({
   executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
