@@ -6,6 +6,7 @@ use super::{CommandError, labels};
 use crate::cli::Settings;
 use bytes::Bytes;
 use coseg::ipc::client::unexpected;
+use coseg::ipc::convert::mesh_format;
 use coseg::ipc::wire::{self, reply, request, shape_input::Source};
 use coseg::labels::score::{Score, ScoredShape, score};
 use coseg::labels::{Baseline, DiscoveryOptions};
@@ -147,10 +148,7 @@ fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, CommandError> {
         shapes.push(Known {
             name,
             bytes: bytes.into(),
-            format: match format {
-                Format::Off => wire::MeshFormat::Off,
-                Format::Obj => wire::MeshFormat::Obj,
-            },
+            format: mesh_format(format),
             mesh: TriMesh {
                 vertices: parsed.vertices,
                 faces: parsed.triangles,
