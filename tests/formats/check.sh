@@ -12,7 +12,7 @@ trap '[ -z "${daemon:-}" ] || kill "$daemon" 2>/dev/null || true; rm -rf "$work"
 
 python3 -m venv "$work/venv"
 "$work/venv/bin/pip" install -q numpy trimesh plyfile usd-core
-npm install --silent --no-audit --no-fund --prefix "$work" gltf-validator@2 three@0.170 >/dev/null
+npm install --silent --no-audit --no-fund --prefix "$work" gltf-validator@latest three@0.170 >/dev/null
 cp "$here"/*.mjs "$work/"
 
 "$coseg" synth chair --count 3 --faces 1500 --out "$work/made"
