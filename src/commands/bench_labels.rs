@@ -7,6 +7,7 @@ use crate::cli::Settings;
 use bytes::Bytes;
 use coseg::call;
 use coseg::ipc::client::unexpected;
+use coseg::ipc::convert::mesh_format;
 use coseg::ipc::frames::FrameWriter;
 use coseg::ipc::wire::{
     self, correct_labels_request::Correction, reply, request, shape_input::Source,
@@ -153,10 +154,7 @@ fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, CommandError> {
         shapes.push(Known {
             name,
             bytes: bytes.into(),
-            format: match format {
-                Format::Off => wire::MeshFormat::Off,
-                Format::Obj => wire::MeshFormat::Obj,
-            },
+            format: mesh_format(format),
             mesh: TriMesh {
                 vertices: parsed.vertices,
                 faces: parsed.triangles,
