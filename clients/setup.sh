@@ -5,6 +5,7 @@ COSEG_BIN="${COSEG_BIN:-$ROOT/target/release/coseg}"
 # Kept between runs if it is named, else temporary.
 if [ -z "${COSEG_CLIENTS_WORK:-}" ]; then
     COSEG_CLIENTS_WORK="$(mktemp -d)"
+    OWN_WORK=1
     trap 'rm -rf "$COSEG_CLIENTS_WORK"' EXIT
 fi
 WORK="$COSEG_CLIENTS_WORK"
@@ -15,9 +16,9 @@ export PATH
 
 step() { printf '\n== %s (%ss)\n' "$1" "$SECONDS"; }
 
-# need COMMAND PACKAGE...: installs Debian packages unless the command is there.
+# need COMMAND PACKAGE...: installs Debian packages unless the command is there (`-`: in any case).
 need() {
-    if command -v "$1" >/dev/null; then return; fi
+    if [ "$1" != - ] && command -v "$1" >/dev/null; then return; fi
     shift
     apt-get update -qq
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
@@ -40,7 +41,7 @@ python_tools() {
 # Node 20 or newer: Debian's may be older, then the one of the package `node` is taken.
 node_tools() {
     need npm nodejs npm
-    if ! node -e 'process.exit(Number(process.versions.node.split(".")[0]) < 20)'; then
+    if ! node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)'; then
         npm install --silent --no-audit --no-fund --prefix "$WORK/node" node@20
         hash -r
     fi

@@ -5,6 +5,7 @@
 mod cli;
 mod correcting;
 mod daemon;
+mod golden;
 mod harness;
 mod pipeline;
 mod spectra;
