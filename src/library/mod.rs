@@ -34,6 +34,8 @@ mod commit;
 mod correct;
 mod error;
 mod history;
+pub mod isolate;
+mod jobs;
 mod lane;
 mod learnt;
 mod merge;
@@ -49,6 +51,7 @@ mod types;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
+pub use jobs::JobFilter;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
@@ -78,6 +81,10 @@ pub struct Library {
     max_maps: AtomicU64,
     max_relabelled: AtomicU64,
 }
+
+/// How the work on one shape is done: here, or in another process.
+pub type Describer<'a> =
+    dyn Fn(&isolate::DescribeJob<'_>, &dyn Fn(&str) -> bool) -> isolate::Described + 'a;
 
 /// A description with what the library needs to commit it.
 #[derive(Debug, Clone)]

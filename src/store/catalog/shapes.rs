@@ -212,7 +212,7 @@ impl Tx<'_> {
                 AND digest NOT IN (SELECT description_digest FROM shapes))
                OR (kind = 'original'
                 AND digest NOT IN (SELECT content_digest FROM shapes)
-                AND digest NOT IN (SELECT original_digest FROM job_items WHERE status = 'queued'))
+                AND digest NOT IN (SELECT original_digest FROM job_items WHERE status IN ('queued', 'failed')))
              RETURNING file",
         )?;
         let files = statement.query_map([], |row| row.get(0))?;
