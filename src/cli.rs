@@ -3,7 +3,7 @@
 mod care;
 mod corrections;
 
-pub(crate) use care::{Jobs, Keys, KeysCommand, Retry};
+pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 
 use crate::commands::bench::Bench;
@@ -161,6 +161,10 @@ pub(crate) enum Command {
     Worker,
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
+    /// Copy a library, also while a daemon uses it, and verify the copy; needs no daemon
+    Snapshot(Snapshot),
+    /// Make a library of a snapshot
+    Restore(Restore),
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
@@ -469,6 +473,9 @@ pub(crate) struct Check {
     /// Folder of the library [default: as `coseg config show` says]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
+    /// Compute anew what is damaged and can be; put the damaged files aside. Not beside a daemon
+    #[arg(long)]
+    pub(crate) repair: bool,
 }
 
 /// `coseg config`

@@ -74,3 +74,26 @@ pub(crate) struct Retry {
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
+
+/// `coseg snapshot`
+#[derive(Debug, Args)]
+pub(crate) struct Snapshot {
+    /// Folder to make
+    pub(crate) to: PathBuf,
+    /// Folder of the library [default: as `coseg config show` says]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) library: Option<PathBuf>,
+    /// Hard links in the place of copies: at once and without space, but damaged together
+    #[arg(long)]
+    pub(crate) link: bool,
+}
+
+/// `coseg restore`
+#[derive(Debug, Args)]
+pub(crate) struct Restore {
+    /// The snapshot
+    pub(crate) from: PathBuf,
+    /// Folder of the library, missing or empty [default: as `coseg config show` says]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) library: Option<PathBuf>,
+}

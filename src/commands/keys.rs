@@ -15,6 +15,16 @@ use std::path::{Path, PathBuf};
 pub(crate) fn run(args: &Keys, global: &Global) -> Outcome {
     let dir = folder(args)?;
     let allow = dir.join(ALLOW_FILE);
+    if matches!(args.command, KeysCommand::Generate { .. }) {
+        let made = std::fs::DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(&dir);
+        made.map_err(|source| CommandError::File {
+            path: dir.display().to_string(),
+            source,
+        })?;
+    }
     match &args.command {
         KeysCommand::Generate { server: true, .. } => server(&dir, global.json)?,
         KeysCommand::Generate {
@@ -90,14 +100,6 @@ fn folder(args: &Keys) -> Result<PathBuf, CommandError> {
 }
 
 fn server(dir: &Path, as_json: bool) -> Result<(), CommandError> {
-    let made = std::fs::DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(dir);
-    made.map_err(|source| CommandError::File {
-        path: dir.display().to_string(),
-        source,
-    })?;
     let pair = KeyPair::generate()?;
     pair.write(&dir.join(SERVER_KEY_FILE))?;
     let public = dir.join(SERVER_PUBLIC_FILE);

@@ -132,6 +132,8 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
     let done = match &cli.command {
         Command::Serve(args) => serve::run(args, &cli.global),
         Command::Check(args) => check::run(args, &cli.global),
+        Command::Snapshot(args) => check::snapshot(args, &cli.global),
+        Command::Restore(args) => check::restore(args, &cli.global),
         Command::Describe(args) => describe::run(args, &cli.global),
         Command::Config(args) => config::run(args, &cli.global),
         Command::Add(args) => add::run(args, session()?),

@@ -42,6 +42,7 @@ mod merge;
 mod place;
 mod read;
 mod relabel;
+mod repair;
 mod rows;
 mod submit;
 mod suggest;
@@ -53,6 +54,7 @@ pub use error::LibraryError;
 pub use history::Undone;
 pub use jobs::JobFilter;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
+pub use repair::Repaired;
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
 pub use types::{
@@ -63,6 +65,7 @@ pub use types::{
 
 use crate::pipeline::Description;
 use crate::store::check::Finding;
+use crate::store::snapshot::Snapshot;
 use crate::store::{CollectionId, CollectionRow, Digest, Store};
 use lane::Lane;
 use std::collections::HashMap;
@@ -118,6 +121,15 @@ impl Library {
     /// There is no library in `dir`, or it is held or unreadable.
     pub fn check(dir: &Path) -> Result<Vec<Finding>> {
         Ok(crate::store::check::check(dir)?)
+    }
+
+    /// Copies the library in `from`, also while it is in use, to `to`, and verifies the copy: a snapshot, or the
+    /// restoring of one.
+    ///
+    /// # Errors
+    /// There is no library in `from`, something in `to`, or the copy cannot be written.
+    pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot> {
+        Ok(crate::store::snapshot::copy(from, to, link)?)
     }
 
     /// The store, for care: its health and the sweep of orphans.

@@ -413,12 +413,12 @@ fn unix_secs() -> u64 {
 
 /// What decides the bits of a description besides bytes and parameters: the algorithm, and the instruction set that
 /// the kernels choose at run time.
-fn algorithm() -> String {
+pub(super) fn algorithm() -> String {
     format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new())
 }
 
 /// The parameters of a collection's descriptions, and the text that names them.
-fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
+pub(super) fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
     let operator = operator_from_name(&row.operator, &format!("collections {}", row.name))?;
     let params = Params {
         operator,

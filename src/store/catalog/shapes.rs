@@ -219,6 +219,14 @@ impl Tx<'_> {
         Ok(files.collect::<rusqlite::Result<_>>()?)
     }
 
+    /// Writes the global descriptor of a shape, in the place of one that cannot be read.
+    pub fn put_signature(&self, shape: ShapeId, signature: &[f32]) -> Result<()> {
+        self.execute("DELETE FROM shape_signatures WHERE shape_id = ?1", [shape])?;
+        let signature = floats_to_blob(signature);
+        self.insert(&SHAPE_SIGNATURES, shape, params![shape, signature])?;
+        Ok(())
+    }
+
     /// Inserts a shape, whose object files must be catalogued. It has no labels yet: the first
     /// [`Tx::put_labels`] makes version `new.version + 1`.
     pub fn insert_shape(&self, new: &NewShapeRow) -> Result<ShapeId> {
