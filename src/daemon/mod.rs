@@ -5,29 +5,36 @@
 //! [`work`] describes and places accepted shapes; [`publish`] sends what the event log gained.
 //! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
 
+mod access;
+mod fair;
 mod http;
 mod memory;
 mod metrics;
 mod progress;
 mod publish;
+mod quota;
 mod reads;
 mod requests;
 mod service;
 mod sockets;
 mod work;
+mod worker;
 mod writes;
 
 pub use service::{ServeError, serve};
+pub use worker::{POISON_VARIABLE, WORKER_COMMAND, run_worker};
 
 use crate::Library;
 use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
+use crate::ipc::keys::KeyError;
 use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use metrics::Metrics;
 use progress::Waiting;
 use publish::Notice;
+use quota::Quotas;
 use sockets::Outbox;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -52,6 +59,10 @@ pub enum StartError {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Endpoint(#[from] EndpointError),
+    #[error(transparent)]
+    Keys(#[from] KeyError),
+    #[error("this binary was built without CURVE; keys cannot be used")]
+    NoCurve,
     #[error("library {path}: {source}")]
     Library { path: String, source: LibraryError },
     #[error("{endpoint}: {source}")]
@@ -64,6 +75,8 @@ pub enum StartError {
         address: std::net::SocketAddr,
         source: std::io::Error,
     },
+    #[error("a worker process cannot be started: {0}")]
+    Worker(std::io::Error),
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -72,13 +85,15 @@ impl StartError {
     /// Whether the configuration or the command line must be changed.
     pub fn is_configuration(&self) -> bool {
         match self {
-            Self::Config(_) => true,
+            Self::Config(_) | Self::Keys(_) | Self::NoCurve => true,
             Self::Endpoint(e) => {
                 !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
             }
-            Self::Library { .. } | Self::Socket { .. } | Self::Http { .. } | Self::Threads(_) => {
-                false
-            }
+            Self::Library { .. }
+            | Self::Socket { .. }
+            | Self::Http { .. }
+            | Self::Worker(_)
+            | Self::Threads(_) => false,
         }
     }
 }
@@ -89,6 +104,7 @@ struct Counters {
     requests: AtomicU64,
     refused: AtomicU64,
     failed: AtomicU64,
+    workers_died: AtomicU64,
 }
 
 /// What all tasks of the daemon share.
@@ -104,6 +120,9 @@ struct Daemon {
     /// Where the viewer is served, if it is.
     http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
+    quotas: Arc<Quotas>,
+    /// Whether connections are authenticated.
+    has_keys: bool,
     describe_memory: Arc<Budget>,
     /// A permit for each thread that may describe.
     workers: Arc<Semaphore>,
@@ -114,6 +133,7 @@ struct Daemon {
     outbox: Arc<Outbox>,
     notices: mpsc::UnboundedSender<Notice>,
     work: Work,
+    pool: worker::Pool,
     drain: watch::Sender<bool>,
     /// A client asked for the drain.
     asked_to_drain: std::sync::mpsc::Sender<service::Control>,
@@ -173,7 +193,11 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         uri => Endpoint::parse(uri)?,
     };
     // First the socket: a second daemon should hear of the first, not of its library's lock.
-    let bound = sockets::bind(&endpoint, &config.limits)?;
+    if config.has_keys() && zmq::has("curve") != Some(true) {
+        return Err(StartError::NoCurve);
+    }
+    let access = access::Access::new(&config.security.keys)?;
+    let bound = sockets::bind(&endpoint, &config.limits, access)?;
     let address = config.http.address()?;
     let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
@@ -203,6 +227,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         metrics: Arc::new(Metrics::new()),
         http: listener.as_ref().and_then(|l| l.local_addr().ok()),
         request_memory: Budget::new(config.limits.request_bytes()),
+        quotas: Quotas::new(&config.limits),
+        has_keys: config.has_keys(),
         describe_memory: Budget::new(config.limits.describe_bytes()),
         workers: Arc::new(Semaphore::new(n_workers)),
         n_workers,
@@ -211,6 +237,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         outbox: Arc::clone(&bound.outbox),
         notices,
         work: Work::new(),
+        pool: worker::Pool::new(n_workers).map_err(StartError::Worker)?,
         drain: watch::Sender::new(false),
         asked_to_drain,
         config: RwLock::new(Arc::new(config)),
@@ -250,6 +277,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     drop(guard);
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
+        quotas: Arc::clone(&daemon.quotas),
         counters: Arc::clone(&daemon.counters),
         metrics: Arc::clone(&daemon.metrics),
         tick: Arc::clone(&socket_tick),
@@ -283,6 +311,11 @@ fn instance() -> String {
 async fn sweep(daemon: Arc<Daemon>) {
     loop {
         tokio::time::sleep(SWEEP_EVERY).await;
+        match blocking(&daemon, |d| d.library.forget_old()).await {
+            Ok(Ok((replies, jobs))) => tracing::debug!(replies, jobs, "forgot what is old"),
+            Ok(Err(e)) => tracing::warn!(error = %e, "old replies and jobs cannot be forgotten"),
+            Err(panic) => tracing::error!(panic, "forgetting old replies panicked"),
+        }
         let swept = blocking(&daemon, |d| d.library.store().sweep_orphans(ORPHAN_AGE)).await;
         match swept {
             Ok(Ok(files)) if files.is_empty() => {}
@@ -337,6 +370,8 @@ impl Running {
         self.daemon
             .request_memory
             .set_limit(config.limits.request_bytes());
+        self.daemon.quotas.set_limits(&config.limits);
+        self.daemon.outbox.reload();
         self.daemon
             .describe_memory
             .set_limit(config.limits.describe_bytes());
@@ -351,6 +386,7 @@ impl Running {
                 new.server.library != config.server.library,
             ),
             ("http", new.http != config.http),
+            ("security.keys", new.security.keys != config.security.keys),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
             (

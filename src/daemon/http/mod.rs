@@ -43,6 +43,8 @@ const MAX_BODY: usize = 8 << 20;
 const ANSWER_MS: u64 = 60_000;
 /// The socket thread looks around twice a second; after this long without it hangs.
 const SOCKETS_HANG: Duration = Duration::from_secs(10);
+/// All browsers together are one client: they take turns with the others, and share its quota.
+const CLIENT: &[u8] = b"http";
 /// Header without which nothing is changed.
 const GUARD: &str = "x-coseg";
 
@@ -284,6 +286,11 @@ impl Server {
         let Some(memory) = self.daemon.request_memory.try_reserve(n_bytes) else {
             return Err(busy("requests in hand leave no memory for this one"));
         };
+        let admitted = self
+            .daemon
+            .quotas
+            .admit(&Bytes::from_static(CLIENT), n_bytes);
+        let ticket = admitted.map_err(|text| busy(&text))?;
         let (sender, receiver) = oneshot::channel();
         let incoming = Incoming {
             reply_to: ReplyTo::Task(sender),
@@ -295,6 +302,7 @@ impl Server {
             frames,
             received: Instant::now(),
             memory: Some(memory),
+            ticket,
         };
         if self.requests.try_send(incoming).is_err() {
             return Err(busy("too many requests wait"));
