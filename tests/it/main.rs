@@ -5,6 +5,7 @@
 mod cli;
 mod correcting;
 mod daemon;
+mod formats;
 mod golden;
 mod harness;
 mod pipeline;
