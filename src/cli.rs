@@ -1,7 +1,9 @@
 //! What was typed becomes one command with typed flags.
 
+mod care;
 mod corrections;
 
+pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 
 use crate::commands::bench::Bench;
@@ -55,6 +57,24 @@ pub(crate) struct Global {
         hide_env_values = true
     )]
     pub(crate) endpoint: Option<String>,
+    /// The daemon's public key, if it has keys: server.pub, as `coseg keys generate --server` made it
+    #[arg(
+        long,
+        global = true,
+        env = "COSEG_SERVER_KEY",
+        value_name = "FILE",
+        hide_env_values = true
+    )]
+    pub(crate) server_key: Option<PathBuf>,
+    /// This client's keys, as `coseg keys generate NAME` made them
+    #[arg(
+        long,
+        global = true,
+        env = "COSEG_CLIENT_KEY",
+        value_name = "FILE",
+        hide_env_values = true
+    )]
+    pub(crate) client_key: Option<PathBuf>,
     /// Seconds to wait for an answer; work that goes on is waited for all the same
     #[arg(long, global = true, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
     pub(crate) timeout: Duration,
@@ -130,8 +150,21 @@ pub(crate) enum Command {
     /// Measure on meshes with known answers, in temporary libraries
     #[command(subcommand)]
     Bench(Bench),
+    /// List jobs, or the shapes that failed and why
+    Jobs(Jobs),
+    /// Queue the failed shapes of a job again
+    Retry(Retry),
+    /// Make keys, and say who may connect
+    Keys(Keys),
+    /// Describe shapes for a daemon, which starts this by itself
+    #[command(hide = true)]
+    Worker,
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
+    /// Copy a library, also while a daemon uses it, and verify the copy; needs no daemon
+    Snapshot(Snapshot),
+    /// Make a library of a snapshot
+    Restore(Restore),
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
@@ -145,6 +178,9 @@ pub(crate) struct Serve {
     pub(crate) library: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) file: ConfigFile,
+    /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
+    #[arg(long, value_name = "DIR")]
+    pub(crate) keys: Option<PathBuf>,
     /// Threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
@@ -447,6 +483,9 @@ pub(crate) struct Check {
     /// Folder of the library [default: as `coseg config show` says]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
+    /// Compute anew what is damaged and can be; put the damaged files aside. Not beside a daemon
+    #[arg(long)]
+    pub(crate) repair: bool,
 }
 
 /// `coseg config`

@@ -53,6 +53,8 @@ pub struct Config {
     pub limits: Limits,
     /// What may come in.
     pub ingest: Ingest,
+    /// Who may connect.
+    pub security: Security,
     /// What is told to the operator.
     pub log: Log,
 }
@@ -90,6 +92,14 @@ pub struct Limits {
     pub max_queued_shapes: usize,
     /// Requests being answered or waiting for it.
     pub max_requests: usize,
+    /// The same, of one client.
+    pub max_requests_per_client: usize,
+    /// Bytes of requests in hand of one client.
+    pub max_bytes_per_client: ByteSize,
+    /// Bytes of the files of accepted shapes that are not placed yet.
+    pub max_queued_bytes: ByteSize,
+    /// Seconds that placing all accepted shapes may take, as estimated.
+    pub max_queued_seconds: u64,
 }
 
 /// What may come in.
@@ -97,6 +107,13 @@ pub struct Limits {
 pub struct Ingest {
     /// Directories below which AddShapes may name files.
     pub paths: Vec<PathBuf>,
+}
+
+/// Who may connect.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Security {
+    /// Folder of keys; empty: none.
+    pub keys: PathBuf,
 }
 
 /// What is told to the operator.
@@ -127,6 +144,8 @@ pub struct Overrides {
     pub endpoint: Option<String>,
     /// `--library`.
     pub library: Option<PathBuf>,
+    /// `--keys`.
+    pub keys: Option<PathBuf>,
     /// `--workers`.
     pub workers: Option<usize>,
     /// `--log-level`.
@@ -187,6 +206,9 @@ impl Config {
         if let Some(library) = &overrides.library {
             config.server.library.clone_from(library);
         }
+        if let Some(keys) = &overrides.keys {
+            config.security.keys.clone_from(keys);
+        }
         if let Some(workers) = overrides.workers {
             config.work.workers = workers;
         }
@@ -217,6 +239,24 @@ impl Config {
         )?;
         at_least("limits.max_queued_shapes", self.limits.max_queued_shapes, 1)?;
         at_least("limits.max_requests", self.limits.max_requests, 1)?;
+        let per_client = self.limits.max_requests_per_client;
+        at_least("limits.max_requests_per_client", per_client, 1)?;
+        for (key, found) in [
+            (
+                "limits.max_bytes_per_client",
+                self.limits.max_bytes_per_client,
+            ),
+            ("limits.max_queued_bytes", self.limits.max_queued_bytes),
+        ] {
+            if found < self.limits.max_message {
+                let limit = self.limits.max_message;
+                return refuse(key, format!("{found} is below limits.max_message, {limit}"));
+            }
+        }
+        if self.limits.max_queued_seconds == 0 {
+            let message = "0 is below the least value, 1".to_owned();
+            return refuse("limits.max_queued_seconds", message);
+        }
         if self.limits.memory.0 < MIN_MEMORY {
             let (found, limit) = (self.limits.memory, ByteSize(MIN_MEMORY));
             return refuse(
@@ -257,13 +297,18 @@ impl Config {
         }
         if !self.server.endpoint.is_empty() {
             crate::ipc::endpoint::Endpoint::parse(&self.server.endpoint)
-                .and_then(|e| e.check_servable())
+                .and_then(|e| e.check_servable(self.has_keys()))
                 .map_err(|e| ConfigError::Value {
                     key: "server.endpoint".to_owned(),
                     message: e.to_string(),
                 })?;
         }
         Ok(())
+    }
+
+    /// Whether every connection is to be encrypted and authenticated.
+    pub fn has_keys(&self) -> bool {
+        !self.security.keys.as_os_str().is_empty()
     }
 
     /// The library's folder: as set, or the default for this user.

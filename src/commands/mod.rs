@@ -13,7 +13,9 @@ pub(crate) mod describe;
 mod events;
 mod export;
 mod export_mesh;
+mod jobs;
 mod json;
+mod keys;
 mod labels;
 mod ls;
 mod map;
@@ -38,6 +40,7 @@ use coseg::config::ConfigError;
 use coseg::daemon::ServeError;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::endpoint::EndpointError;
+use coseg::ipc::keys::KeyError;
 use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
@@ -48,6 +51,9 @@ pub(crate) enum CommandError {
     /// The daemon did not answer, or refused.
     #[error(transparent)]
     Client(#[from] ClientError),
+    /// Keys cannot be used.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
     /// The configuration is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -96,6 +102,7 @@ impl CommandError {
             | Self::Serve(_)
             | Self::Library(_)
             | Self::Telemetry(_)
+            | Self::Keys(_)
             | Self::Synth(_)
             | Self::Failed(_)
             | Self::File { .. }
@@ -125,6 +132,8 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
     let done = match &cli.command {
         Command::Serve(args) => serve::run(args, &cli.global),
         Command::Check(args) => check::run(args, &cli.global),
+        Command::Snapshot(args) => check::snapshot(args, &cli.global),
+        Command::Restore(args) => check::restore(args, &cli.global),
         Command::Describe(args) => describe::run(args, &cli.global),
         Command::Config(args) => config::run(args, &cli.global),
         Command::Add(args) => add::run(args, session()?),
@@ -151,6 +160,10 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
             .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
         Command::Bench(args) => bench::run(args, &cli.global),
+        Command::Jobs(args) => jobs::jobs(args, session()?),
+        Command::Retry(args) => jobs::retry(args, session()?),
+        Command::Keys(args) => keys::run(args, &cli.global),
+        Command::Worker => return Ok(coseg::daemon::run_worker()),
         Command::Stats => stats::run(session()?),
         Command::Stop => stop::run(session()?),
     }?;

@@ -11,6 +11,7 @@ pub(crate) fn run(args: &Serve, global: &Global) -> Outcome {
         file: args.file.config.clone(),
         endpoint: global.endpoint.clone(),
         library: args.library.clone(),
+        keys: args.keys.clone(),
         workers: args.workers,
         log_level: args.log_level.clone(),
     };

@@ -6,7 +6,7 @@ use crate::daemon::{Daemon, requests};
 use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
-use crate::library::LibraryError;
+use crate::library::{JobFilter, LibraryError};
 use crate::mesh::Format;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -48,6 +48,7 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
                 job: Some(daemon.job_to_wire(&job)),
             })
         }
+        Body::ListJobs(r) => Reply::ListJobs(list_jobs(daemon, &r)?),
         Body::ListShapes(r) => Reply::ListShapes(list_shapes(daemon, &r)?),
         Body::GetShape(r) => {
             let shape = library.shape(&r.collection, &r.shape).map_err(refuse)?;
@@ -121,6 +122,7 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
         | Body::Undo(_)
         | Body::AddShapes(_)
         | Body::CancelJob(_)
+        | Body::RetryJob(_)
         | Body::RemoveShape(_)
         | Body::Drain(_)
         | Body::WatchJob(_)
@@ -168,6 +170,25 @@ fn list_shapes(
     Ok(wire::ListShapesReply {
         shapes: shapes.iter().map(convert::shape).collect(),
         next_page_token: last.unwrap_or_default(),
+    })
+}
+
+fn list_jobs(
+    daemon: &Daemon,
+    r: &wire::ListJobsRequest,
+) -> Result<wire::ListJobsReply, wire::Error> {
+    let size = page("page_size", r.page_size, MAX_PAGE)?;
+    let filter = JobFilter {
+        failed: r.failed,
+        before: r.before,
+        collection: Some(r.collection.clone()).filter(|c| !c.is_empty()),
+    };
+    let mut jobs = daemon.library.jobs(&filter, size + 1).map_err(refuse)?;
+    let more = jobs.len() > size;
+    jobs.truncate(size);
+    Ok(wire::ListJobsReply {
+        jobs: jobs.iter().map(|j| daemon.job_to_wire(j)).collect(),
+        more,
     })
 }
 

@@ -1,6 +1,7 @@
-//! Requests are sorted by what they need: reads run side by side, changes one after the other in order
-//! of arrival, waits hold no thread.
+//! Requests are sorted by what they need: reads run side by side, changes of one collection one after the
+//! other, what is taken in likewise, waits hold no thread. Where requests queue up, clients take turns.
 
+use crate::daemon::fair::{Gate, Turn};
 use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
 use crate::daemon::{Daemon, blocking, reads, writes};
@@ -8,16 +9,19 @@ use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
 use crate::library::Job;
 use bytes::Bytes;
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
 
 /// Longest wait of WatchJob and WaitIdle, in milliseconds.
 pub(crate) const MAX_WAIT_MS: u64 = 30_000;
 /// WatchJob answers changes no faster than this, so that a client that asks again at once does not read
 /// a job from the catalog a thousand times a second.
 const WATCH_PACE: Duration = Duration::from_millis(50);
+/// Collections whose gates are kept before idle ones are forgotten.
+const MAX_GATES: usize = 1_024;
 /// Reads that run at a time beyond the workers; they mostly wait for the disk.
 const EXTRA_READS: usize = 2;
 
@@ -32,10 +36,10 @@ pub(crate) struct InHand {
 
 /// Sorts requests until the socket thread ends.
 pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<Incoming>) {
-    // Bounded by the permits.
-    let (writes_in, writes_out) = mpsc::unbounded_channel();
-    tokio::spawn(change_in_order(Arc::clone(&daemon), writes_out));
-    let readers = Arc::new(Semaphore::new(daemon.n_workers + EXTRA_READS));
+    // What queues up at the gates is bounded by the permits.
+    let readers = Gate::new(daemon.n_workers + EXTRA_READS);
+    let intake = Gate::new(1);
+    let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
         let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
             let error = busy("too many requests are in hand");
@@ -53,21 +57,31 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             continue;
         };
         let in_hand = InHand { incoming, permit };
+        let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
+        // Changes of labels may wait while a lane learns; nothing else waits with them.
+        let gate = changed_collection(&body).map(|name| {
+            if collections.len() >= MAX_GATES {
+                collections.retain(|_, gate| Arc::strong_count(gate) > 1);
+            }
+            let gate = collections.entry(name.to_owned());
+            Arc::clone(gate.or_insert_with(|| Gate::new(1)))
+        });
         match body {
-            Body::CreateCollection(_)
-            | Body::DeleteCollection(_)
+            Body::DeleteCollection(_)
             | Body::NameLabel(_)
             | Body::CorrectLabels(_)
             | Body::MergeLabels(_)
             | Body::SplitLabel(_)
             | Body::Undo(_)
+            | Body::RemoveShape(_)
+            | Body::CreateCollection(_)
             | Body::AddShapes(_)
             | Body::CancelJob(_)
-            | Body::RemoveShape(_)
+            | Body::RetryJob(_)
             | Body::Drain(_) => {
-                // The receiver ends after this sender.
-                let _ = writes_in.send((body, in_hand));
+                let turn = gate.as_ref().unwrap_or(&intake).queue(&client);
+                tokio::spawn(change_in_turn(daemon, body, in_hand, turn));
             }
             Body::WatchJob(request) => {
                 tokio::spawn(in_hand.respond(daemon, async move |d| watch_job(&d, &request).await));
@@ -80,6 +94,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::ListCollections(_)
             | Body::DescribeCollection(_)
             | Body::GetJob(_)
+            | Body::ListJobs(_)
             | Body::ListShapes(_)
             | Body::GetShape(_)
             | Body::GetLabels(_)
@@ -93,10 +108,9 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::Nearest(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
-                let readers = Arc::clone(&readers);
+                let turn = readers.queue(&client);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
-                    let reader = readers.acquire_owned().await;
-                    let _reader = reader.expect("invariant: the semaphore is never closed");
+                    let _pass = turn.come().await;
                     blocking(&d, move |d| reads::answer(d, body))
                         .await
                         .unwrap_or_else(panicked)
@@ -106,54 +120,65 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     }
 }
 
-/// Carries out changes in order of arrival.
-async fn change_in_order(
-    daemon: Arc<Daemon>,
-    mut changes: mpsc::UnboundedReceiver<(Body, InHand)>,
-) {
-    while let Some((body, mut in_hand)) = changes.recv().await {
-        if in_hand.is_late() {
-            in_hand.late(&daemon, None);
-            continue;
-        }
-        let key = writes::key(&in_hand.incoming.request);
-        let frames = std::mem::take(&mut in_hand.incoming.frames);
-        // Given back when the change is made: who waits for the placing holds no frames.
-        let memory = in_hand.incoming.memory.take();
-        let done = blocking(&daemon, move |d| {
-            let _memory = memory;
-            let (body, frames) = (body, frames);
-            writes::change(d, &body, &frames, key.as_ref())
-        });
-        let done = done.await;
-        match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-            Ok(writes::Done::Now(result)) => {
-                let drain = matches!(*result, reply::Result::Drain(_));
-                in_hand.finish(&daemon, Ok((*result, Vec::new())));
-                if drain {
-                    // After the reply, which would else come too late for the sockets. An error
-                    // means that the main thread is gone: the daemon is ending already.
-                    let _ = daemon.asked_to_drain.send(Control::Drain);
-                }
+/// The collection whose labels, or existence, a request changes.
+fn changed_collection(body: &Body) -> Option<&str> {
+    Some(match body {
+        Body::DeleteCollection(r) => &r.collection,
+        Body::NameLabel(r) => &r.collection,
+        Body::CorrectLabels(r) => &r.collection,
+        Body::MergeLabels(r) => &r.collection,
+        Body::SplitLabel(r) => &r.collection,
+        Body::Undo(r) => &r.collection,
+        Body::RemoveShape(r) => &r.collection,
+        _ => return None,
+    })
+}
+
+/// Carries out a change when its turn comes.
+async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, turn: Turn) {
+    let Some(pass) = in_hand.by_deadline(turn.come()).await else {
+        return in_hand.late(&daemon, None);
+    };
+    if in_hand.is_late() {
+        return in_hand.late(&daemon, None);
+    }
+    let key = writes::key(&in_hand.incoming.request);
+    let frames = std::mem::take(&mut in_hand.incoming.frames);
+    // Given back when the change is made: who waits for the placing holds no frames.
+    let memory = in_hand.incoming.memory.take();
+    let done = blocking(&daemon, move |d| {
+        let _memory = memory;
+        let (body, frames) = (body, frames);
+        writes::change(d, &body, &frames, key.as_ref())
+    });
+    let done = done.await;
+    drop(pass);
+    in_hand.incoming.ticket.free_bytes();
+    match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
+        Ok(writes::Done::Now(result)) => {
+            let drain = matches!(*result, reply::Result::Drain(_));
+            in_hand.finish(&daemon, Ok((*result, Vec::new())));
+            if drain {
+                // After the reply, which would else come too late for the sockets. An error
+                // means that the main thread is gone: the daemon is ending already.
+                let _ = daemon.asked_to_drain.send(Control::Drain);
             }
-            Ok(writes::Done::WhenPlaced(job)) => {
-                let daemon = Arc::clone(&daemon);
-                tokio::spawn(async move {
-                    let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
-                    match placed {
-                        Some(answer) => in_hand.finish(&daemon, answer),
-                        None => in_hand.late(&daemon, Some(job)),
-                    }
-                });
-            }
-            Err(error) => in_hand.finish(&daemon, Err(error)),
         }
+        Ok(writes::Done::WhenPlaced(job)) => {
+            let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
+            match placed {
+                Some(answer) => in_hand.finish(&daemon, answer),
+                None => in_hand.late(&daemon, Some(job)),
+            }
+        }
+        Err(error) => in_hand.finish(&daemon, Err(error)),
     }
 }
 
 impl InHand {
     /// Sends the reply and gives back the permit.
     fn finish(self, daemon: &Daemon, answer: Answer) {
+        drop(self.incoming.ticket);
         daemon.answer(self.incoming.peer, self.incoming.request.request_id, answer);
         drop(self.permit);
     }

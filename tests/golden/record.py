@@ -508,17 +508,17 @@ def composed(r: Recorder) -> None:
             # Reasons that are added to the protocol are composed too, until they are recorded.
             code, message, more = texts.get(reason, ("FAILED_PRECONDITION", "not recorded yet", {}))
             r.compose(reason, code, message, **more)
-    reply = message_pb2.Reply(request_id="drain")
-    reply.drain.n_queued = 3
-    request = message_pb2.Request(request_id="drain", client_id=CLIENT)
-    request.drain.SetInParent()
-    r.keep(
-        "drain",
-        "the daemon stops, composed",
-        [request.SerializeToString()],
-        [reply.SerializeToString()],
-        "composed",
-    )
+    shown_bodies = {body for entry in r.index for body in entry["reply"]}
+    for field in message_pb2.Reply.DESCRIPTOR.oneofs_by_name["result"].fields:
+        body = field.name
+        if body not in shown_bodies:
+            # Stopping the daemon ends a recording, and a request that was added is not recorded yet.
+            request = message_pb2.Request(request_id=body, client_id=CLIENT)
+            reply = message_pb2.Reply(request_id=body)
+            getattr(request, body).SetInParent()
+            getattr(reply, body).SetInParent()
+            shows = f"{body}, an empty reply, composed"
+            r.keep(body, shows, [request.SerializeToString()], [reply.SerializeToString()], "composed")
     samples = []
     for field in event_pb2.Event.DESCRIPTOR.oneofs_by_name["kind"].fields:
         event = event_pb2.Event(sequence=5, collection="things")
