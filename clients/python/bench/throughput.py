@@ -1,7 +1,7 @@
 """How fast shapes go in and labels come out, through the client and through the raw socket.
 
-``python clients/python/bench/throughput.py BINARY`` starts a daemon on a temporary library. What is measured is
-the way there and back: shapes that are there already (`unchanged`), so that labelling does not hide it.
+``python clients/python/bench/throughput.py BINARY`` starts a daemon on a temporary library. It measures the
+way there and back: shapes that are there already (`unchanged`), so that labelling does not hide it.
 """
 
 from __future__ import annotations
