@@ -14,3 +14,4 @@ mod snapshot;
 mod spectra;
 mod store;
 mod tidy;
+mod viewing;
