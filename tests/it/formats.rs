@@ -139,8 +139,9 @@ fn labels_of_glb(bytes: &[u8], found: &ParsedMesh, original: &ParsedMesh) -> Vec
         );
         let runs: Vec<usize> = serde_json::from_value(extras["polygons"].clone()).unwrap();
         for run in runs.chunks(2) {
-            for polygon in run[0]..run[0] + run[1] {
-                labels[polygon] = label;
+            let polygons = run[0]..run[0] + run[1];
+            labels[polygons.clone()].fill(label);
+            for polygon in polygons {
                 assert_eq!(triangles.next(), Some(&original.triangles[polygon]));
             }
         }

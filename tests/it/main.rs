@@ -6,6 +6,7 @@ mod cli;
 mod correcting;
 mod daemon;
 mod formats;
+mod golden;
 mod harness;
 mod pipeline;
 mod spectra;
