@@ -11,11 +11,14 @@ const BAND_EDGES: f64 = 1.5;
 /// Boundary strength of the cut, and the least probability that counts.
 const STRENGTH: f64 = 3.0;
 const FLOOR: f64 = 0.02;
-/// The strength holds where an edge of the proxy is at most this many of the surface, plus one. On finer ones
+/// All this holds where an edge of the proxy is at most this many of the surface, plus one. On finer ones
 /// evidence, which grows with area, would outweigh boundaries, which grow with length, until labels follow the
 /// proxy's triangles; so the strength grows along, up to a limit beyond which cuts would take long.
 const TUNED_RATIO: f64 = 3.0;
-const MAX_GAIN: f64 = 6.0;
+const MAX_GAIN: f64 = 2.0;
+/// There the proxy does not say where within a triangle a boundary runs: evidence is full only this far from it,
+/// in mean edge lengths of the proxy.
+const UNSURE_EDGES: f64 = 0.75;
 
 /// Classes of the faces `(m,)` of a full-resolution surface, given for each its proxy face, and the proxy's
 /// classes `(p,)` and probabilities `(p, k)`, 0 to 255. `proxy_edge` is the proxy's mean edge length, in the
@@ -66,20 +69,22 @@ pub fn refine_boundary(
         centroids: Vec::new(),
         edges,
     };
+    let lengths: f64 = surface.edges.iter().map(|e| e.length).sum();
+    let ratio = proxy_edge * surface.edges.len() as f64 / lengths.max(1e-300);
+    let gain = (ratio - TUNED_RATIO).clamp(1.0, MAX_GAIN);
+    let unsure = (gain - 1.0).min(1.0);
     let mut unary = Vec::with_capacity(members.len() * k);
     let mut pinned = Vec::with_capacity(members.len());
     for &f in &members {
         let p = proxy_face[f as usize] as usize;
+        let near = 1.0 - (depth[f as usize] / (UNSURE_EDGES * proxy_edge)).min(1.0);
+        let weight = 1.0 - unsure * near;
         unary.extend((0..k).map(|l| {
-            -(f64::from(probabilities[p * k + l]) / 255.0)
-                .max(FLOOR)
-                .ln()
+            let probability = f64::from(probabilities[p * k + l]) / 255.0;
+            -probability.max(FLOOR).ln() * weight
         }));
         pinned.push((!depth[f as usize].is_finite()).then_some(labels[f as usize]));
     }
-    let lengths: f64 = surface.edges.iter().map(|e| e.length).sum();
-    let ratio = proxy_edge * surface.edges.len() as f64 / lengths.max(1e-300);
-    let gain = (ratio - TUNED_RATIO).clamp(1.0, MAX_GAIN);
     let refined = cut(&sub, &unary, k, gain * STRENGTH, Some(&pinned));
     for (f, l) in members.into_iter().zip(refined) {
         labels[f as usize] = l;
