@@ -90,14 +90,17 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetDescriptors(_)
             | Body::GetFunctionalMap(_)
             | Body::GetPartCorrespondence(_)
+            | Body::TransferFunction(_)
             | Body::Nearest(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let readers = Arc::clone(&readers);
+                let mut in_hand = in_hand;
+                let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
                     let reader = readers.acquire_owned().await;
                     let _reader = reader.expect("invariant: the semaphore is never closed");
-                    blocking(&d, move |d| reads::answer(d, body))
+                    blocking(&d, move |d| reads::answer(d, body, &frames))
                         .await
                         .unwrap_or_else(panicked)
                 }));

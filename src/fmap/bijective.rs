@@ -192,7 +192,10 @@ impl Pair {
         let departure = |m: &[f32]| {
             let entries = m.iter().enumerate();
             let one = |i: usize| if i / k == i % k { 1.0 } else { 0.0 };
-            entries.map(|(i, x)| f64::from(x - one(i)).powi(2)).sum::<f64>() / k as f64
+            entries
+                .map(|(i, x)| f64::from(x - one(i)).powi(2))
+                .sum::<f64>()
+                / k as f64
         };
         let gram = |c: &[f32]| departure(&transposed_product(c, c, k, k, k));
         0.5 * (gram(&self.c_12) + gram(&self.c_21))

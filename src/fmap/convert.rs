@@ -10,7 +10,13 @@ use crate::linalg::nearest::nearest_rows;
 ///
 /// # Panics
 /// If there are fewer eigenvectors, or a vertex of the map does not exist.
-pub fn functional(one: &Basis<'_>, two: &Basis<'_>, p2p_21: &[u32], k1: usize, k2: usize) -> Vec<f32> {
+pub fn functional(
+    one: &Basis<'_>,
+    two: &Basis<'_>,
+    p2p_21: &[u32],
+    k1: usize,
+    k2: usize,
+) -> Vec<f32> {
     two.project(&one.rows(p2p_21, k1), k1, k2)
 }
 

@@ -184,11 +184,16 @@ impl Level {
     /// With further probe functions, given at all vertices.
     fn marked(&self, more: &Probes, weight: f32) -> Self {
         let scale = (weight / more.dim.max(1) as f32).sqrt();
-        let rows = self.probes.chunks_exact(self.dim).zip(&self.samples.vertices);
+        let rows = self
+            .probes
+            .chunks_exact(self.dim)
+            .zip(&self.samples.vertices);
         let probes = rows.flat_map(|(row, &v)| {
             let at = v as usize * more.dim;
             let more = &more.values[at..at + more.dim];
-            row.iter().copied().chain(more.iter().map(move |x| scale * x))
+            row.iter()
+                .copied()
+                .chain(more.iter().map(move |x| scale * x))
         });
         Self {
             probes: probes.collect(),
@@ -226,7 +231,10 @@ pub fn estimate(
     for (s, stage) in options.stages.iter().enumerate() {
         let marked = landmarks.map(|(x, y)| {
             let weight = options.landmark_weight / options.probe_weight.max(1e-6);
-            (one.levels[s].marked(x, weight), two.levels[s].marked(y, weight))
+            (
+                one.levels[s].marked(x, weight),
+                two.levels[s].marked(y, weight),
+            )
         });
         let (a, b) = match &marked {
             Some((a, b)) => (a, b),
@@ -255,6 +263,12 @@ pub fn estimate(
             found.iter().map(|c| (c.pair.clone(), sign(c))).collect()
         };
         let refined = tries.into_iter().map(|(pair, sign)| {
+            // Samples of a small mesh may tell fewer eigenfunctions apart than those of the stage before.
+            let pair = if pair.k > k_end {
+                pair.leading(k_end)
+            } else {
+                pair
+            };
             let turn = Turn {
                 one: &one.orientation,
                 two: &two.orientation,
@@ -265,7 +279,9 @@ pub fn estimate(
             let first = if s == 0 { pair.k } else { pair.k + stage.step };
             let ks = sizes(first, k_end, stage.step);
             let pair = pair.refine(&a.basis, &b.basis, &ks, guidance, Some(&turn));
-            let agreement = one.orientation.agreement(&two.orientation, &pair.c_12, pair.k);
+            let agreement = one
+                .orientation
+                .agreement(&two.orientation, &pair.c_12, pair.k);
             let residual = probe_residual(a, b, &pair);
             let strain = pair.strain();
             let cost = strain
@@ -299,7 +315,10 @@ fn best_of_sides(found: Vec<Candidate>, reversing: bool) -> Vec<Candidate> {
     let (same, other): (Vec<_>, Vec<_>) = found
         .into_iter()
         .partition(|c| (c.agreement < 0.0) == reversing);
-    same.into_iter().take(1).chain(other.into_iter().take(1)).collect()
+    same.into_iter()
+        .take(1)
+        .chain(other.into_iter().take(1))
+        .collect()
 }
 
 fn probe_residual(one: &Level, two: &Level, pair: &Pair) -> f64 {
@@ -326,7 +345,9 @@ fn starts(n_signs: usize) -> Vec<(Pair, f32)> {
         let signs: Vec<f32> = std::iter::once(1.0).chain((0..n_signs).map(sign)).collect();
         Pair::from_signs(&signs)
     });
-    patterns.flat_map(|p| [(p.clone(), 1.0), (p, -1.0)]).collect()
+    patterns
+        .flat_map(|p| [(p.clone(), 1.0), (p, -1.0)])
+        .collect()
 }
 
 /// Sizes from `from` to `to`, both included, by `step`.
@@ -370,5 +391,12 @@ pub fn dense(one: (&Basis<'_>, &Frame), two: &Basis<'_>, pair: &Pair) -> Vec<u32
         return nearest_rows(&queries, &targets, k);
     };
     let cells = &level.samples;
-    nearest_in_cells(&queries, &targets, k, &cells.vertices, &cells.nearest, N_PROBED)
+    nearest_in_cells(
+        &queries,
+        &targets,
+        k,
+        &cells.vertices,
+        &cells.nearest,
+        N_PROBED,
+    )
 }

@@ -17,7 +17,11 @@ const MAX_EIGENPAIRS: usize = 60;
 pub fn landmark_probes(basis: &Basis<'_>, landmarks: &[u32]) -> Probes {
     let k = basis.n_eigenvectors.min(MAX_EIGENPAIRS);
     let dim = landmarks.len() * TIMES.len();
-    let last = basis.eigenvalues[..k].last().copied().unwrap_or(1.0).max(1e-12);
+    let last = basis.eigenvalues[..k]
+        .last()
+        .copied()
+        .unwrap_or(1.0)
+        .max(1e-12);
     let mut sources = Vec::with_capacity(dim * k);
     for &vertex in landmarks {
         for time in TIMES {

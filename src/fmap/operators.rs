@@ -7,7 +7,10 @@ use nalgebra::DMatrix;
 /// # Panics
 /// If lengths differ.
 pub fn multiplication(eigenvectors: &DMatrix<f64>, mass: &[f64], f: &[f64]) -> DMatrix<f64> {
-    assert_eq!((mass.len(), f.len()), (eigenvectors.nrows(), eigenvectors.nrows()));
+    assert_eq!(
+        (mass.len(), f.len()),
+        (eigenvectors.nrows(), eigenvectors.nrows())
+    );
     let mut weighted = eigenvectors.clone();
     for (v, mut row) in weighted.row_iter_mut().enumerate() {
         row *= mass[v] * f[v];
@@ -26,7 +29,10 @@ pub fn crossing(faces: &[[u32; 3]], eigenvectors: &DMatrix<f64>, f: &[f64]) -> D
     assert_eq!(f.len(), eigenvectors.nrows());
     let k = eigenvectors.ncols();
     let rows = eigenvectors.transpose();
-    let (mut centres, mut turned) = (DMatrix::zeros(k, faces.len()), DMatrix::zeros(k, faces.len()));
+    let (mut centres, mut turned) = (
+        DMatrix::zeros(k, faces.len()),
+        DMatrix::zeros(k, faces.len()),
+    );
     for (t, face) in faces.iter().enumerate() {
         let [a, b, c] = face.map(|v| v as usize);
         let (u, w) = (f[b] - f[a], f[c] - f[a]);

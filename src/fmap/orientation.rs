@@ -86,14 +86,22 @@ impl Orientation {
     fn crossed(&self, k: usize) -> (Vec<f32>, usize) {
         let row = |pair: usize| &self.crossed[pair * self.q..(pair + 1) * self.q];
         (
-            self.pairs(k).flat_map(|(pair, ..)| row(pair).iter().copied()).collect(),
+            self.pairs(k)
+                .flat_map(|(pair, ..)| row(pair).iter().copied())
+                .collect(),
             self.q,
         )
     }
 
     /// On `other`, the crossed functions of the eigenfunctions of this shape below `k`, carried there by `c_12`
     /// `(rows, columns)`: `(pairs, other.q)`.
-    fn carried_then_crossed(&self, other: &Self, c_12: &[f32], columns: usize, k: usize) -> Vec<f32> {
+    fn carried_then_crossed(
+        &self,
+        other: &Self,
+        c_12: &[f32],
+        columns: usize,
+        k: usize,
+    ) -> Vec<f32> {
         let rows = c_12.len() / columns.max(1);
         let c = |a: usize, i: usize| c_12[a * columns + i];
         let mut out = Vec::new();
@@ -160,10 +168,6 @@ impl Orientation {
             x.iter_mut().for_each(|v| *v *= scale);
             x
         };
-        (
-            evaluate(&from, q1, one),
-            evaluate(&back, other.q, two),
-            dim,
-        )
+        (evaluate(&from, q1, one), evaluate(&back, other.q, two), dim)
     }
 }

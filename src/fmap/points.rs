@@ -139,8 +139,18 @@ mod tests {
             let polar = std::f64::consts::PI * i as f64 / rings as f64;
             for j in 0..around {
                 let turn = 2.0 * std::f64::consts::PI * j as f64 / around as f64;
-                let bump = 1.0 + 0.9 * (-8.0 * ((polar - 1.2).powi(2) + turn.sin().powi(2) + (1.0 - turn.cos()).powi(2))).exp();
-                let (x, y, z) = (polar.sin() * turn.cos(), polar.sin() * turn.sin(), polar.cos());
+                let bump = 1.0
+                    + 0.9
+                        * (-8.0
+                            * ((polar - 1.2).powi(2)
+                                + turn.sin().powi(2)
+                                + (1.0 - turn.cos()).powi(2)))
+                        .exp();
+                let (x, y, z) = (
+                    polar.sin() * turn.cos(),
+                    polar.sin() * turn.sin(),
+                    polar.cos(),
+                );
                 let stretch = if z > 0.0 { 1.3 } else { 1.0 };
                 vertices.push([1.8 * bump * x, 1.2 * bump * y, stretch * bump * z]);
             }
@@ -167,7 +177,14 @@ mod tests {
         }
     }
 
-    struct Parts(Vec<[f32; 3]>, Vec<[u32; 3]>, Vec<f64>, Vec<f32>, Vec<f32>, usize);
+    struct Parts(
+        Vec<[f32; 3]>,
+        Vec<[u32; 3]>,
+        Vec<f64>,
+        Vec<f32>,
+        Vec<f32>,
+        usize,
+    );
 
     fn parts(mesh: &TriMesh) -> Parts {
         let area: f64 = crate::mesh::FaceGeometry::new(mesh).areas.iter().sum();
@@ -182,7 +199,11 @@ mod tests {
             mesh.vertices.iter().map(|v| v.map(|x| x as f32)).collect(),
             mesh.faces,
             s.eigenvalues,
-            s.eigenvectors.transpose().iter().map(|x| *x as f32).collect(),
+            s.eigenvectors
+                .transpose()
+                .iter()
+                .map(|x| *x as f32)
+                .collect(),
             l.mass.iter().map(|x| *x as f32).collect(),
             60,
         )
@@ -215,7 +236,8 @@ mod tests {
             let sum: f32 = (0..count)
                 .map(|v| {
                     let (p, q) = (a.0[p2p[turn(v)] as usize], a.0[v]);
-                    ((p[0] - q[0]).powi(2) + (p[1] - flip * q[1]).powi(2) + (p[2] - q[2]).powi(2)).sqrt()
+                    ((p[0] - q[0]).powi(2) + (p[1] - flip * q[1]).powi(2) + (p[2] - q[2]).powi(2))
+                        .sqrt()
                 })
                 .sum();
             sum / count as f32
@@ -246,7 +268,13 @@ mod tests {
         let (one, two) = (shape(&p, &options), shape(&p, &options));
         // Ring 8: a quarter to the left of the bump goes to a quarter to the right.
         let ring = |j: u32| 2 + 7 * 32 + j;
-        let landmarks = [[ring(8), ring(24)], [ring(24), ring(8)], [ring(0), ring(0)], [0, 0], [1, 1]];
+        let landmarks = [
+            [ring(8), ring(24)],
+            [ring(24), ring(8)],
+            [ring(0), ring(0)],
+            [0, 0],
+            [1, 1],
+        ];
         let found = point_maps(&one, &two, &landmarks, &options);
         assert!(found[0].orientation < -0.8, "{}", found[0].orientation);
     }

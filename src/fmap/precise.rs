@@ -34,7 +34,13 @@ impl PreciseMap {
 ///
 /// # Panics
 /// If there is no face, or a vertex has none.
-pub fn precise(one: &Basis<'_>, two: &Basis<'_>, faces: &[[u32; 3]], c_12: &[f32], k1: usize) -> PreciseMap {
+pub fn precise(
+    one: &Basis<'_>,
+    two: &Basis<'_>,
+    faces: &[[u32; 3]],
+    c_12: &[f32],
+    k1: usize,
+) -> PreciseMap {
     let k2 = c_12.len() / k1;
     let targets = product_transposed(&one.leading(k1), c_12, one.n_vertices(), k1, k2);
     let queries = two.leading(k2);
@@ -91,7 +97,13 @@ fn nearest_in_triangle(p: &[f32], [a, b, c]: [&[f32]; 3]) -> (f32, [f32; 3]) {
         cc += w * w;
     }
     let (d3, d4, d5, d6) = (d1 - bb, d2 - bc, d1 - bc, d2 - cc);
-    let clamp = |x: f64| if x.is_finite() { x.clamp(0.0, 1.0) } else { 0.0 };
+    let clamp = |x: f64| {
+        if x.is_finite() {
+            x.clamp(0.0, 1.0)
+        } else {
+            0.0
+        }
+    };
     let (va, vb, vc) = (d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2);
     let weights = if d1 <= 0.0 && d2 <= 0.0 {
         [1.0, 0.0, 0.0]
@@ -130,7 +142,8 @@ mod tests {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(8);
         let mut inside = 0;
         for _ in 0..300 {
-            let mut point = || -> Vec<f32> { (0..5).map(|_| rng.random_range(-1.0..1.0)).collect() };
+            let mut point =
+                || -> Vec<f32> { (0..5).map(|_| rng.random_range(-1.0..1.0)).collect() };
             let (a, b, c, p) = (point(), point(), point(), point());
             let (distance, w) = nearest_in_triangle(&p, [&a, &b, &c]);
             assert!(w.iter().all(|x| *x >= 0.0) && (w.iter().sum::<f32>() - 1.0).abs() < 1e-5);

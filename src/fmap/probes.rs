@@ -119,8 +119,9 @@ fn outward_normals(vertices: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[f32; 3]> {
             std::array::from_fn(|i| b[i] - a[i]),
             std::array::from_fn(|i| c[i] - a[i]),
         );
-        let cross: [f32; 3] =
-            std::array::from_fn(|i| u[(i + 1) % 3] * w[(i + 2) % 3] - u[(i + 2) % 3] * w[(i + 1) % 3]);
+        let cross: [f32; 3] = std::array::from_fn(|i| {
+            u[(i + 1) % 3] * w[(i + 2) % 3] - u[(i + 2) % 3] * w[(i + 1) % 3]
+        });
         volume += (0..3).map(|i| f64::from(a[i] * cross[i])).sum::<f64>();
         for v in face {
             for (n, x) in normals[*v as usize].iter_mut().zip(cross) {
@@ -151,7 +152,11 @@ pub fn standardise(values: &mut [f32], dim: usize, mass: &[f32]) {
         for (c, x) in row.iter_mut().enumerate() {
             let variance = square[c] - mean[c] * mean[c];
             let least = 1e-10 * square[c].max(1e-12);
-            let scale = if variance > least { variance.sqrt().recip() } else { 0.0 };
+            let scale = if variance > least {
+                variance.sqrt().recip()
+            } else {
+                0.0
+            };
             *x = ((f64::from(*x) - mean[c]) * scale) as f32;
         }
     }

@@ -4,6 +4,9 @@ use super::basis::{Basis, product, transposed_product};
 use super::zoomout::MapShape;
 use crate::linalg::nearest::nearest_rows;
 
+/// Vertices that are sent there and back, spread evenly over the numbering.
+const MAX_RETURNED: usize = 500;
+
 /// How good a map is, as kept with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Quality {
@@ -42,7 +45,11 @@ impl Quality {
         let (mut difference, mut total) = (0.0, 0.0);
         for ((x, t), mass) in rows {
             let y = &one.descriptors[*t as usize * dim..(*t as usize + 1) * dim];
-            let d: f64 = x.iter().zip(y).map(|(x, y)| f64::from((x - y) * (x - y))).sum();
+            let d: f64 = x
+                .iter()
+                .zip(y)
+                .map(|(x, y)| f64::from((x - y) * (x - y)))
+                .sum();
             difference += f64::from(*mass) * d;
             total += f64::from(*mass);
         }
@@ -89,15 +96,17 @@ impl Assessment {
         p2p_21: &[u32],
     ) -> Self {
         let k2 = c_12.len() / k1.max(1);
-        // The map back by the same C: rows of Φ₁ against those of Φ₂ C.
+        // The map back by the same C: some rows of Φ₁ against those of Φ₂ C.
+        let step = one.0.n_vertices().div_ceil(MAX_RETURNED).max(1);
+        let vertices: Vec<u32> = (0..one.0.n_vertices() as u32).step_by(step).collect();
         let targets = product(&two.0.leading(k2), c_12, two.0.n_vertices(), k2, k1);
-        let back = nearest_rows(&one.0.leading(k1), &targets, k1);
+        let back = nearest_rows(&one.0.rows(&vertices, k1), &targets, k1);
         let (mut sum, mut total) = (0.0, 0.0);
-        for (v, there) in back.iter().enumerate() {
-            let (a, b) = (one.1[v], one.1[p2p_21[*there as usize] as usize]);
+        for (&v, there) in vertices.iter().zip(&back) {
+            let (a, b) = (one.1[v as usize], one.1[p2p_21[*there as usize] as usize]);
             let d: f32 = (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
-            sum += f64::from(one.0.mass[v] * d);
-            total += f64::from(one.0.mass[v]);
+            sum += f64::from(one.0.mass[v as usize] * d);
+            total += f64::from(one.0.mass[v as usize]);
         }
         let carried = |v: u32| one.1[p2p_21[v as usize] as usize];
         let own = dirichlet(two.2, two.1, |v| two.1[v as usize]);
@@ -109,12 +118,9 @@ impl Assessment {
 }
 
 /// Dirichlet energy of three functions on a mesh; triangles without area are left out.
-fn dirichlet(
-    faces: &[[u32; 3]],
-    vertices: &[[f32; 3]],
-    value: impl Fn(u32) -> [f32; 3],
-) -> f64 {
-    let difference = |a: [f32; 3], b: [f32; 3]| -> [f64; 3] { std::array::from_fn(|i| f64::from(a[i] - b[i])) };
+fn dirichlet(faces: &[[u32; 3]], vertices: &[[f32; 3]], value: impl Fn(u32) -> [f32; 3]) -> f64 {
+    let difference =
+        |a: [f32; 3], b: [f32; 3]| -> [f64; 3] { std::array::from_fn(|i| f64::from(a[i] - b[i])) };
     let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     let mut energy = 0.0;
     for face in faces {
@@ -134,7 +140,6 @@ fn dirichlet(
     }
     energy
 }
-
 
 #[cfg(test)]
 mod tests {
@@ -157,7 +162,12 @@ mod tests {
 
     #[test]
     fn the_energy_of_coordinates_is_twice_the_area() {
-        let vertices = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 1.0, 0.5], [0.0, 1.0, 0.5]];
+        let vertices = [
+            [0.0, 0.0, 0.0],
+            [2.0, 0.0, 0.0],
+            [2.0, 1.0, 0.5],
+            [0.0, 1.0, 0.5],
+        ];
         let faces = [[0, 1, 2], [0, 2, 3]];
         let area = 2.0 * 1.25f64.sqrt();
         let energy = dirichlet(&faces, &vertices, |v| vertices[v as usize]);

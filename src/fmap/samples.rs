@@ -26,7 +26,11 @@ pub fn farthest_point_samples(graph: &EdgeGraph, mass: &[f32], counts: &[usize])
     distances.reset(n);
     let mut nearest = vec![0u32; n];
     let mut vertices = Vec::new();
-    let mut next = if n > 0 { farthest(&graph.dijkstra(0)) } else { 0 };
+    let mut next = if n > 0 {
+        farthest(&graph.dijkstra(0))
+    } else {
+        0
+    };
     let mut found = Vec::with_capacity(counts.len());
     for &count in counts {
         while vertices.len() < count.min(n) {

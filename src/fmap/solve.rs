@@ -31,13 +31,17 @@ pub struct Energy {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum SolveError {
     /// Neither probes nor mask determine an entry.
-    #[error("row {row} of the map is not determined: give more probe functions or a positive mask weight")]
+    #[error(
+        "row {row} of the map is not determined: give more probe functions or a positive mask weight"
+    )]
     Undetermined {
         /// Of C.
         row: usize,
     },
     /// Conjugate gradients stopped before the residual was small.
-    #[error("the residual is {residual:e} of the right side after {iterations} iterations, the limit is {limit:e}")]
+    #[error(
+        "the residual is {residual:e} of the right side after {iterations} iterations, the limit is {limit:e}"
+    )]
     Slow {
         /// Relative.
         residual: f64,
@@ -57,7 +61,8 @@ impl Energy {
     pub fn value(&self, c: &DMatrix<f64>) -> f64 {
         let fit = (c * &self.probes_1 - &self.probes_2).norm_squared();
         let mask: f64 = c.iter().zip(&self.mask).map(|(x, m)| m * x * x).sum();
-        let commute = |(x, y, w): &(DMatrix<f64>, DMatrix<f64>, f64)| w * (c * x - y * c).norm_squared();
+        let commute =
+            |(x, y, w): &(DMatrix<f64>, DMatrix<f64>, f64)| w * (c * x - y * c).norm_squared();
         let operators: f64 = self.operators.iter().map(commute).sum();
         0.5 * (self.probe_weight * fit + self.mask_weight * mask + operators)
     }
@@ -82,7 +87,11 @@ impl Energy {
     pub fn minimiser(&self, first_column: &DVector<f64>) -> Result<DMatrix<f64>, SolveError> {
         let (k2, k1) = self.mask.shape();
         assert_eq!(
-            (self.probes_1.nrows(), self.probes_2.nrows(), first_column.len()),
+            (
+                self.probes_1.nrows(),
+                self.probes_2.nrows(),
+                first_column.len()
+            ),
             (k1, k2, k2),
             "sizes of probes, mask and first column"
         );
@@ -144,8 +153,8 @@ impl Energy {
             for j in 0..k1 {
                 let row = x.row(j).norm_squared();
                 for i in 0..k2 {
-                    diagonal[(i, j)] += w
-                        * (row + y.column(i).norm_squared() - 2.0 * x[(j, j)] * y[(i, i)]);
+                    diagonal[(i, j)] +=
+                        w * (row + y.column(i).norm_squared() - 2.0 * x[(j, j)] * y[(i, i)]);
                 }
             }
         }
@@ -286,7 +295,10 @@ mod tests {
     #[test]
     fn masks_are_zero_where_eigenvalues_agree() {
         let values = [0.0, 1.0, 4.0];
-        for mask in [laplacian_mask(&values, &values), resolvent_mask(&values, &values, 0.5)] {
+        for mask in [
+            laplacian_mask(&values, &values),
+            resolvent_mask(&values, &values, 0.5),
+        ] {
             for i in 0..3 {
                 for j in 0..3 {
                     assert_eq!(mask[(i, j)] == 0.0, i == j);

@@ -30,7 +30,9 @@ pub(super) fn cycle(n: usize, turn: usize) -> Curve {
         j => 2f64.sqrt() * (angle(v) * (j / 2) as f64).sin(),
     };
     Curve {
-        eigenvalues: (0..k).map(|j: usize| (j.div_ceil(2) as f64).powi(2)).collect(),
+        eigenvalues: (0..k)
+            .map(|j: usize| (j.div_ceil(2) as f64).powi(2))
+            .collect(),
         eigenvectors: (0..n)
             .flat_map(|v| (0..k).map(move |j| wave(v, j) as f32))
             .collect(),

@@ -57,7 +57,9 @@ pub fn faces_to_faces(
     let mut out = Vec::with_capacity(faces_2.len() * dim);
     for face in faces_2 {
         let corners = face.map(|v| p2p_21[v as usize] as usize * dim);
-        out.extend((0..dim).map(|c| corners.iter().map(|at| at_vertices[at + c]).sum::<f32>() / 3.0));
+        out.extend(
+            (0..dim).map(|c| corners.iter().map(|at| at_vertices[at + c]).sum::<f32>() / 3.0),
+        );
     }
     out
 }
@@ -118,7 +120,10 @@ mod tests {
         let faces = [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]];
         let p2p = [5, 4, 3, 2, 1, 0];
         let labels = [7, 7, 2, 2];
-        assert_eq!(labels_to_faces(&faces, &faces, 6, &p2p, &labels), [2, 2, 7, 7]);
+        assert_eq!(
+            labels_to_faces(&faces, &faces, 6, &p2p, &labels),
+            [2, 2, 7, 7]
+        );
         let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[1.0, 1.0, 1.0, 1.0], 1);
         assert!(carried.iter().all(|x| (x - 1.0).abs() < 1e-6));
     }

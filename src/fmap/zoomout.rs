@@ -149,7 +149,10 @@ pub fn zoomout_sampled(
 }
 
 fn mean_square(shape: &MapShape<'_>) -> f64 {
-    let rows = shape.descriptors.chunks_exact(shape.dim.max(1)).zip(shape.mass);
+    let rows = shape
+        .descriptors
+        .chunks_exact(shape.dim.max(1))
+        .zip(shape.mass);
     let sum: f64 = rows
         .map(|(row, m)| f64::from(*m) * row.iter().map(|x| f64::from(x * x)).sum::<f64>())
         .sum();
@@ -235,7 +238,11 @@ mod tests {
         let one = SampledBasis::new(&a.basis(), &ids(23), &mass, 11);
         let two = SampledBasis::new(&b.basis(), &ids(0), &mass, 11);
         let sampled = zoomout_sampled(&one, &two, &c, 3, &[5, 7, 9, 11]);
-        let error: f32 = sampled.iter().zip(&large).map(|(x, y)| (x - y).powi(2)).sum();
+        let error: f32 = sampled
+            .iter()
+            .zip(&large)
+            .map(|(x, y)| (x - y).powi(2))
+            .sum();
         assert!(error < 1e-4, "{error}");
     }
 

@@ -38,6 +38,7 @@ mod lane;
 mod learnt;
 mod merge;
 mod place;
+mod points;
 mod read;
 mod relabel;
 mod rows;
@@ -50,6 +51,7 @@ pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
+pub use points::{PointRequest, PolygonValues};
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
 pub use types::{

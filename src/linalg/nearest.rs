@@ -89,8 +89,14 @@ pub fn nearest_in_cells(
         next[*c as usize] += 1;
     }
     let row = |t: u32| &targets[t as usize * dim..(t as usize + 1) * dim];
-    let grouped: Vec<f32> = members.iter().flat_map(|&t| row(t).iter().copied()).collect();
-    let centre_rows: Vec<f32> = centres.iter().flat_map(|&t| row(t).iter().copied()).collect();
+    let grouped: Vec<f32> = members
+        .iter()
+        .flat_map(|&t| row(t).iter().copied())
+        .collect();
+    let centre_rows: Vec<f32> = centres
+        .iter()
+        .flat_map(|&t| row(t).iter().copied())
+        .collect();
     let centre_norms = half_norms(&centre_rows, dim);
     let norms = half_norms(&grouped, dim);
     let n_queries = queries.len() / dim;
@@ -128,7 +134,12 @@ pub fn nearest_in_cells(
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 8];
     let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f32 = a8.remainder().iter().zip(b8.remainder()).map(|(x, y)| x * y).sum();
+    let rest: f32 = a8
+        .remainder()
+        .iter()
+        .zip(b8.remainder())
+        .map(|(x, y)| x * y)
+        .sum();
     for (x, y) in a8.zip(b8) {
         for lane in 0..8 {
             sums[lane] += x[lane] * y[lane];

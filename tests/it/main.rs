@@ -8,6 +8,7 @@ mod daemon;
 mod formats;
 mod golden;
 mod harness;
+mod maps;
 mod pipeline;
 mod spectra;
 mod store;
