@@ -3,6 +3,7 @@
 mod add;
 pub(crate) mod bench;
 mod bench_labels;
+mod bench_maps;
 mod check;
 mod collections;
 mod completions;
