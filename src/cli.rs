@@ -293,7 +293,7 @@ impl Operator {
 /// `coseg add`
 #[derive(Debug, Args)]
 pub(crate) struct Add {
-    /// Mesh files (.obj, .off), or folders of them; a shape's name is its file's stem
+    /// Mesh files (.obj, .off, .ply, .stl, .glb, .gltf), or folders of them; a shape's name is its file's stem
     #[arg(required = true, value_name = "PATH")]
     pub(crate) paths: Vec<PathBuf>,
     /// The collection, created if missing; without it the only one there is, or a new one named default
@@ -374,6 +374,16 @@ pub(crate) enum ExportFormat {
     Ply,
     /// NAME.obj and labels.mtl: the mesh with a group and a material for each label
     Obj,
+    /// NAME.glb: the mesh with a primitive and a named material for each label
+    Glb,
+    /// NAME.usda: the mesh with a GeomSubset and a material for each label
+    Usda,
+    /// NAME.labels.npy: an int32 for each face of the file
+    Npy,
+    /// NAME.labels.json: the labels and their names
+    Json,
+    /// NAME.seg: as labels, under the name that Princeton's tools expect
+    Seg,
 }
 
 /// `coseg map`

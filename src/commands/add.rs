@@ -8,6 +8,7 @@ use super::{CommandError, Outcome, json};
 use crate::cli::Add;
 use bytes::Bytes;
 use coseg::ipc::client::unexpected;
+use coseg::ipc::convert::mesh_format;
 use coseg::ipc::wire::{self, ItemState, reply, request, shape_input::Source};
 use coseg::mesh::Format;
 use indicatif::ProgressBar;
@@ -121,13 +122,9 @@ struct Batch {
 
 impl Batch {
     fn push(&mut self, file: &MeshFile, bytes: Vec<u8>, replace: bool) {
-        let format = match file.format {
-            Format::Obj => wire::MeshFormat::Obj,
-            Format::Off => wire::MeshFormat::Off,
-        };
         let frame = u32::try_from(self.frames.len()).expect("invariant: batches are small");
         let encoded = wire::EncodedMesh {
-            format: format.into(),
+            format: mesh_format(file.format).into(),
             bytes: Some(wire::BytesRef { frame }),
         };
         self.n_bytes += bytes.len() as u64;
@@ -297,7 +294,8 @@ fn mesh_files(paths: &[PathBuf]) -> Result<Vec<MeshFile>, CommandError> {
             let n = files.len();
             folder(path, &mut files)?;
             if files.len() == n {
-                let text = format!("{} has no mesh files (.obj, .off)", path.display());
+                let (path, known) = (path.display(), Format::EXTENSIONS);
+                let text = format!("{path} has no mesh files ({known})");
                 return Err(CommandError::Usage(text));
             }
         } else if !path.exists() {
@@ -307,7 +305,8 @@ fn mesh_files(paths: &[PathBuf]) -> Result<Vec<MeshFile>, CommandError> {
             )));
         } else {
             let file = mesh_file(path)?.ok_or_else(|| {
-                let text = format!("{} is not a mesh file (.obj, .off)", path.display());
+                let (path, known) = (path.display(), Format::EXTENSIONS);
+                let text = format!("{path} is not a mesh file ({known})");
                 CommandError::Usage(text)
             })?;
             files.push(file);
@@ -348,7 +347,10 @@ fn folder(path: &Path, files: &mut Vec<MeshFile>) -> Result<(), CommandError> {
         match mesh_file(&path.join(&name))? {
             Some(file) => files.push(file),
             None if is_beside_meshes(&name) => {}
-            None => eprintln!("coseg: {name} is skipped, it is not a mesh file (.obj, .off)"),
+            None => {
+                let known = Format::EXTENSIONS;
+                eprintln!("coseg: {name} is skipped, it is not a mesh file ({known})");
+            }
         }
     }
     Ok(())
@@ -392,6 +394,10 @@ mod tests {
             "10.off",
             "9.OBJ",
             "9.labels.txt",
+            "11.Glb",
+            "12.gltf",
+            "13.stl",
+            "14.PLY",
             "1.off",
             "x.step",
             ".hidden.off",
@@ -401,7 +407,7 @@ mod tests {
         }
         let files = mesh_files(&[folder.path().to_owned()]).unwrap();
         let names: Vec<_> = files.iter().map(|f| f.name.as_str()).collect();
-        assert_eq!(names, ["1", "9", "10"]);
+        assert_eq!(names, ["1", "9", "10", "11", "12", "13", "14"]);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::cli::{Global, up};
 use clap::{Args, Subcommand};
 use coseg::ipc::wire;
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 /// `coseg bench`
@@ -38,6 +39,10 @@ pub(crate) struct BenchLabels {
     /// Let the daemon estimate the number of part kinds
     #[arg(long)]
     estimate: bool,
+    /// After the stream, give the shapes that the daemon suggests their true labels, and score the others by label id once
+    /// as many are labelled as each of these numbers says, such as 1,3,5
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=100))]
+    exemplars: Vec<u32>,
     /// Only stream: no batch answer, no baselines (which see 60 shapes at most, spread evenly)
     #[arg(long)]
     no_baselines: bool,
@@ -58,6 +63,14 @@ struct Row {
 impl Row {
     fn accuracies(&self) -> Vec<f64> {
         self.runs.iter().map(|r| r.accuracy).collect()
+    }
+
+    /// Accuracy with labelled shapes, for each number of them, over the orders.
+    fn with_exemplars(&self) -> Vec<f64> {
+        let n = self.runs.first().map_or(0, |r| r.with_exemplars.len());
+        (0..n)
+            .map(|i| mean(self.runs.iter().map(|r| r.with_exemplars[i])))
+            .collect()
     }
 
     fn spread(&self) -> f64 {
@@ -83,7 +96,10 @@ pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
     if global.json {
         print_line(&report(&rows).to_string())?;
     } else {
-        print_line(&table(&lines(&rows)))?;
+        print_line(&table(&lines(
+            &rows,
+            &args.exemplars.iter().copied().collect(),
+        )))?;
     }
     Ok(rows.iter().flat_map(|r| &r.runs).all(|r| r.n_missing == 0))
 }
@@ -95,6 +111,7 @@ fn row(
     up: wire::Up,
     global: &Global,
 ) -> Result<Row, CommandError> {
+    let counts = exemplars(args, category)?;
     let mut runs = Vec::new();
     let mut others = Vec::new();
     for order in 0..args.orders {
@@ -111,6 +128,10 @@ fn row(
             category.n_parts as u32
         };
         let run = bench_labels::stream(category, order, n_parts, up, &mut session);
+        let run = run.and_then(|mut run| {
+            run.with_exemplars = bench_labels::with_exemplars(category, &counts, &mut session)?;
+            Ok(run)
+        });
         drop(session);
         running.drain(DRAIN_LIMIT);
         runs.push(run?);
@@ -132,16 +153,30 @@ fn row(
     })
 }
 
+/// How many shapes are labelled by hand, ascending; at least one must be left over to be scored.
+fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, CommandError> {
+    let counts: BTreeSet<usize> = args.exemplars.iter().map(|n| *n as usize).collect();
+    let n_shapes = category.shapes.len();
+    match counts.last().filter(|n| **n >= n_shapes) {
+        Some(n) => Err(CommandError::Usage(format!(
+            "--exemplars {n} leaves no shape of {} to score: it has {n_shapes}",
+            category.name
+        ))),
+        None => Ok(counts.into_iter().collect()),
+    }
+}
+
 fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count().max(1) as f64
 }
 
 /// The table: a line for each category, the mean last.
-fn lines(rows: &[Row]) -> Vec<Vec<String>> {
+fn lines(rows: &[Row], exemplars: &BTreeSet<u32>) -> Vec<Vec<String>> {
     let mut head = ["category", "shapes", "parts", "found", "streamed", "spread"]
         .map(str::to_owned)
         .to_vec();
     let others = rows.first().map_or(&[][..], |r| &r.others);
+    head.extend(exemplars.iter().map(|n| format!("{n} labelled")));
     head.extend(others.iter().map(|o| o.0.to_owned()));
     let mut lines = vec![head];
     for r in rows {
@@ -154,6 +189,7 @@ fn lines(rows: &[Row]) -> Vec<Vec<String>> {
             format!("{:.3}", mean(r.accuracies().into_iter())),
             format!("{:.3}", r.spread()),
         ];
+        line.extend(r.with_exemplars().iter().map(|a| format!("{a:.3}")));
         line.extend(r.others.iter().map(|o| format!("{:.3}", o.1)));
         lines.push(line);
     }
@@ -166,6 +202,8 @@ fn lines(rows: &[Row]) -> Vec<Vec<String>> {
         String::new(),
     ];
     last.extend([format!("{streamed:.3}"), format!("{spread:.3}")]);
+    let labelled = |i| mean(rows.iter().map(|r| r.with_exemplars()[i]));
+    last.extend((0..exemplars.len()).map(|i| format!("{:.3}", labelled(i))));
     last.extend(
         (0..others.len()).map(|i| format!("{:.3}", mean(rows.iter().map(|r| r.others[i].1)))),
     );
@@ -186,6 +224,7 @@ fn report(rows: &[Row]) -> Value {
                     "n_labels": run.n_labels,
                     "n_missing": run.n_missing,
                     "seconds": run.seconds,
+                    "with_exemplars": run.with_exemplars,
                 })
             })
             .collect();
@@ -200,6 +239,7 @@ fn report(rows: &[Row]) -> Value {
             "n_parts": r.n_parts,
             "accuracy": mean(r.accuracies().into_iter()),
             "spread": r.spread(),
+            "with_exemplars": r.with_exemplars(),
             "orders": runs,
             "others": others,
         })

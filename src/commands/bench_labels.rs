@@ -5,9 +5,14 @@ use super::session::Session;
 use super::{CommandError, labels};
 use crate::cli::Settings;
 use bytes::Bytes;
+use coseg::call;
 use coseg::ipc::client::unexpected;
-use coseg::ipc::wire::{self, reply, request, shape_input::Source};
-use coseg::labels::score::{Score, ScoredShape, score};
+use coseg::ipc::convert::mesh_format;
+use coseg::ipc::frames::FrameWriter;
+use coseg::ipc::wire::{
+    self, correct_labels_request::Correction, reply, request, shape_input::Source,
+};
+use coseg::labels::score::{Score, ScoredShape, accuracy_by_id, score};
 use coseg::labels::{Baseline, DiscoveryOptions};
 use coseg::library::Library;
 use coseg::mesh::{self, Format, TriMesh};
@@ -51,6 +56,8 @@ pub(crate) struct Run {
     pub(crate) n_labels: usize,
     pub(crate) n_missing: usize,
     pub(crate) seconds: f64,
+    /// Accuracy of the others after some shapes were labelled by hand, for each number of them that was asked for.
+    pub(crate) with_exemplars: Vec<f64>,
     labels: Vec<Option<Vec<i32>>>,
 }
 
@@ -147,10 +154,7 @@ fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, CommandError> {
         shapes.push(Known {
             name,
             bytes: bytes.into(),
-            format: match format {
-                Format::Off => wire::MeshFormat::Off,
-                Format::Obj => wire::MeshFormat::Obj,
-            },
+            format: mesh_format(format),
             mesh: TriMesh {
                 vertices: parsed.vertices,
                 faces: parsed.triangles,
@@ -224,6 +228,25 @@ pub(crate) fn stream(
         };
         wait(job_id, session)?;
     }
+    let labels = labels_now(category, session)?;
+    let score = scored(&category.name, category.shapes.iter(), &labels)?;
+    Ok(Run {
+        accuracy: score.accuracy,
+        purity: score.purity,
+        rand_error: score.rand_error,
+        n_labels: score.n_predicted_labels,
+        n_missing: score.n_missing,
+        seconds: begin.elapsed().as_secs_f64(),
+        with_exemplars: Vec::new(),
+        labels,
+    })
+}
+
+/// The labels of all shapes once nothing is waiting; `None` for a shape that is not there.
+fn labels_now(
+    category: &Category,
+    session: &mut Session,
+) -> Result<Vec<Option<Vec<i32>>>, CommandError> {
     session.wait_until_idle(COLLECTION)?;
     let there: BTreeSet<String> = session
         .shapes(COLLECTION, None)?
@@ -244,16 +267,63 @@ pub(crate) fn stream(
             None
         });
     }
-    let score = scored(&category.name, category.shapes.iter(), &labels)?;
-    Ok(Run {
-        accuracy: score.accuracy,
-        purity: score.purity,
-        rand_error: score.rand_error,
-        n_labels: score.n_predicted_labels,
-        n_missing: score.n_missing,
-        seconds: begin.elapsed().as_secs_f64(),
-        labels,
-    })
+    Ok(labels)
+}
+
+/// A person labels the shapes that the daemon suggests, one by one, until as many are labelled as `counts` says: for each
+/// of these (ascending) the accuracy of the other shapes, labels compared by id.
+pub(crate) fn with_exemplars(
+    category: &Category,
+    counts: &[usize],
+    session: &mut Session,
+) -> Result<Vec<f64>, CommandError> {
+    let mut labelled = BTreeSet::new();
+    let mut accuracies = Vec::with_capacity(counts.len());
+    for &count in counts {
+        while labelled.len() < count {
+            session.wait_until_idle(COLLECTION)?;
+            let collection = COLLECTION.to_owned();
+            let suggested = call!(
+                session.client,
+                SuggestNext(wire::SuggestNextRequest { collection })
+            )?;
+            let at = category
+                .shapes
+                .iter()
+                .position(|s| s.name == suggested.shape);
+            let at = at.ok_or_else(|| {
+                CommandError::Failed(format!("{:?} was suggested and not sent", suggested.shape))
+            })?;
+            let truth = &category.shapes[at].truth;
+            let mut frames = FrameWriter::default();
+            let labels = frames.i32_array(truth, &[truth.len()]);
+            let request = wire::CorrectLabelsRequest {
+                collection: COLLECTION.to_owned(),
+                shape: suggested.shape,
+                correction: Some(Correction::Labels(labels)),
+            };
+            let frames = frames.finish();
+            call!(session.client, CorrectLabels(request), frames, with_frames)?;
+            labelled.insert(at);
+        }
+        let labels = labels_now(category, session)?;
+        let others: Vec<ScoredShape<'_>> = category
+            .shapes
+            .iter()
+            .zip(&labels)
+            .enumerate()
+            .filter(|(at, _)| !labelled.contains(at))
+            .map(|(_, (s, labels))| ScoredShape {
+                mesh: &s.mesh,
+                truth: &s.truth,
+                predicted: labels.as_deref(),
+            })
+            .collect();
+        let accuracy = accuracy_by_id(&others);
+        accuracies
+            .push(accuracy.map_err(|e| CommandError::Failed(format!("{}: {e}", category.name)))?);
+    }
+    Ok(accuracies)
 }
 
 fn wait(job_id: u64, session: &mut Session) -> Result<(), CommandError> {

@@ -22,7 +22,7 @@ use std::time::Instant;
 /// `coseg describe`
 #[derive(Debug, Args)]
 pub(crate) struct Describe {
-    /// A mesh file (.obj, .off)
+    /// A mesh file (.obj, .off, .ply, .stl, .glb, .gltf)
     pub(crate) mesh: PathBuf,
     /// Write the arrays to this safetensors file
     #[arg(long, short, value_name = "FILE")]
@@ -126,7 +126,8 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
     };
     let Some(format) = Format::from_name(&path) else {
         return Err(CommandError::Usage(format!(
-            "{path}: the extension is none of .obj .off"
+            "{path}: the extension is none of {}",
+            Format::EXTENSIONS
         )));
     };
     let bytes = fs::read(&args.mesh).map_err(file)?;

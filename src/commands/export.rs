@@ -6,11 +6,12 @@ use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
 use coseg::call;
 use coseg::ipc::client::ClientError;
+use coseg::ipc::convert::format_from_wire;
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
-use coseg::mesh::write::{mtl, obj, ply};
-use coseg::mesh::{Format, ParsedMesh, parse};
-use serde_json::json;
+use coseg::mesh::write::{glb, mtl, npy, obj, ply, seg, usda};
+use coseg::mesh::{ParsedMesh, parse};
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 /// The material file that exported OBJ files name.
@@ -48,28 +49,21 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             confidence: false,
         };
         let labels = labels::receive(&mut session, request)?.labels;
-        match args.format {
-            ExportFormat::Labels => {
-                let lines: String = labels.iter().map(|l| format!("{l}\n")).collect();
-                write(format!("{shape}.labels.txt"), lines.as_bytes())?;
-            }
-            ExportFormat::Ply => {
-                let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, &infos)).collect();
-                let bytes = ply(&mesh.vertices, &polygons(&mesh), &colours, &labels);
-                write(format!("{shape}.ply"), &bytes)?;
-            }
-            ExportFormat::Obj => {
-                let mesh = original(&mut session, &collection, shape, labels.len())?;
-                let name = |label| material(label, &infos);
-                let text = obj(&mesh.vertices, &polygons(&mesh), &labels, name, MATERIALS);
-                write(format!("{shape}.obj"), text.as_bytes())?;
-            }
-        }
+        let (name, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, &infos) {
+            found
+        } else {
+            let mesh = original(&mut session, &collection, shape, labels.len())?;
+            with_mesh(args.format, shape, &mesh, &labels, &infos)
+        };
+        write(name, &bytes)?;
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        write(MATERIALS.to_owned(), mtl(&materials(&infos)).as_bytes())?;
+        let named: Vec<(String, [u8; 3])> = materials(&infos)
+            .into_iter()
+            .map(|(_, name, colour)| (name, colour))
+            .collect();
+        write(MATERIALS.to_owned(), mtl(&named).as_bytes())?;
     }
     progress.finish_and_clear();
     if session.json {
@@ -80,6 +74,66 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         eprintln!("{} shapes written to {}", shapes.len(), args.out.display());
     }
     Ok(true)
+}
+
+/// Name and bytes of a file that holds labels alone; `None` for formats that need the mesh.
+fn without_mesh(
+    format: ExportFormat,
+    shape: &str,
+    labels: &[i32],
+    infos: &[wire::LabelInfo],
+) -> Option<(String, Vec<u8>)> {
+    Some(match format {
+        ExportFormat::Labels => (format!("{shape}.labels.txt"), seg(labels).into_bytes()),
+        ExportFormat::Seg => (format!("{shape}.seg"), seg(labels).into_bytes()),
+        ExportFormat::Npy => (format!("{shape}.labels.npy"), npy(labels)),
+        ExportFormat::Json => {
+            let names: serde_json::Map<String, Value> = materials(infos)
+                .into_iter()
+                .map(|(label, name, _)| (label.to_string(), name.into()))
+                .collect();
+            let value = json!({ "shape": shape, "labels": labels, "names": names });
+            (
+                format!("{shape}.labels.json"),
+                value.to_string().into_bytes(),
+            )
+        }
+        ExportFormat::Ply | ExportFormat::Obj | ExportFormat::Glb | ExportFormat::Usda => {
+            return None;
+        }
+    })
+}
+
+/// Name and bytes of a file that holds the mesh with its labels.
+fn with_mesh(
+    format: ExportFormat,
+    shape: &str,
+    mesh: &ParsedMesh,
+    labels: &[i32],
+    infos: &[wire::LabelInfo],
+) -> (String, Vec<u8>) {
+    let (vertices, polygons) = (&mesh.vertices, polygons(mesh));
+    let name = |label| material(label, infos);
+    let named = |label| (material(label, infos), colour(label, infos));
+    match format {
+        ExportFormat::Obj => {
+            let text = obj(vertices, &polygons, labels, name, MATERIALS);
+            (format!("{shape}.obj"), text.into_bytes())
+        }
+        ExportFormat::Glb => {
+            let bytes = glb(shape, vertices, &polygons, labels, named);
+            (format!("{shape}.glb"), bytes)
+        }
+        ExportFormat::Usda => {
+            let text = usda(shape, vertices, &polygons, labels, named);
+            (format!("{shape}.usda"), text.into_bytes())
+        }
+        _ => {
+            let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, infos)).collect();
+            let bytes = ply(vertices, &polygons, &colours, labels);
+            (format!("{shape}.ply"), bytes)
+        }
+    }
 }
 
 fn at(path: &Path, source: std::io::Error) -> CommandError {
@@ -102,11 +156,8 @@ pub(super) fn original(
     };
     let (reply, frames) = call!(session.client, GetOriginal(request), frames)?;
     let bad = |message: String| CommandError::Client(ClientError::BadReply(message));
-    let format = match reply.format() {
-        wire::MeshFormat::Obj => Format::Obj,
-        wire::MeshFormat::Off => Format::Off,
-        wire::MeshFormat::Unspecified => return Err(bad("a mesh of unknown format".to_owned())),
-    };
+    let format = format_from_wire(reply.format())
+        .ok_or_else(|| bad("a mesh of unknown format".to_owned()))?;
     let bytes = FrameReader::new(&frames)
         .file(reply.bytes.as_ref(), "bytes")
         .map_err(|e| bad(e.to_string()))?;

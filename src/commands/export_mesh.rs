@@ -44,13 +44,13 @@ pub(crate) fn material(label: i32, labels: &[LabelInfo]) -> String {
     }
 }
 
-/// Names and colours of the materials of all labels, and of what has none.
-pub(crate) fn materials(infos: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
+/// All labels, and -1 for what has none, with the names and colours of their materials.
+pub(crate) fn materials(infos: &[LabelInfo]) -> Vec<(i32, String, [u8; 3])> {
     let ids = infos
         .iter()
         .filter_map(|l| i32::try_from(l.id).ok())
         .chain([-1]);
-    ids.map(|id| (material(id, infos), colour(id, infos)))
+    ids.map(|id| (id, material(id, infos), colour(id, infos)))
         .collect()
 }
 
@@ -97,8 +97,8 @@ mod tests {
     fn labels_have_their_names_and_colours() {
         let found = materials(&infos());
         let expected = [
-            ("label_7_long_leg".to_owned(), [1, 2, 255]),
-            ("unlabelled".to_owned(), [128, 128, 128]),
+            (7, "label_7_long_leg".to_owned(), [1, 2, 255]),
+            (-1, "unlabelled".to_owned(), [128, 128, 128]),
         ];
         assert_eq!(found, expected);
         assert_eq!(material(8, &infos()), "label_8");

@@ -89,6 +89,7 @@ fn report(r: &wire::CleanReport) -> Value {
         "n_isolated_vertices": r.n_isolated_vertices,
         "n_degenerate_triangles": r.n_degenerate_triangles,
         "n_duplicate_triangles": r.n_duplicate_triangles,
+        "n_flipped_triangles": r.n_flipped_triangles,
         "n_nonmanifold_edges": r.n_nonmanifold_edges,
         "n_boundary_edges": r.n_boundary_edges,
         "n_components": r.n_components,

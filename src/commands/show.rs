@@ -84,6 +84,7 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
             ("isolated vertices", r.n_isolated_vertices),
             ("degenerate triangles dropped", r.n_degenerate_triangles),
             ("duplicate triangles dropped", r.n_duplicate_triangles),
+            ("triangles turned over", r.n_flipped_triangles),
             ("non-manifold edges", r.n_nonmanifold_edges),
             ("boundary edges", r.n_boundary_edges),
             ("virtual edges between components", r.n_bridges),

@@ -7,6 +7,7 @@ use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
 use crate::library::{JobFilter, LibraryError};
+use crate::mesh::Format;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -226,7 +227,7 @@ fn hello(daemon: &Daemon) -> wire::HelloReply {
             max_wait_ms: requests::MAX_WAIT_MS.min(MAX_WAIT_MS),
             max_id_chars: MAX_ID_CHARS as u32,
         }),
-        formats: vec![wire::MeshFormat::Obj.into(), wire::MeshFormat::Off.into()],
+        formats: Format::ALL.map(|f| convert::mesh_format(f).into()).to_vec(),
         capabilities: CAPABILITIES.map(str::to_owned).to_vec(),
         event_endpoint: daemon.events.to_string(),
         instance: daemon.instance.clone(),

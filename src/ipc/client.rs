@@ -355,8 +355,8 @@ fn dealer(
     let connect = || {
         let socket = context.socket(zmq::DEALER)?;
         socket.set_linger(LINGER_MS)?;
-        // Nothing is queued for a daemon that is not there.
-        socket.set_immediate(true)?;
+        // Not ZMQ_IMMEDIATE: with it, an answer that has arrived is thrown away if the daemon closes the
+        // connection before it is read, as it does after the last answer of a drain.
         let v6 = matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('['));
         socket.set_ipv6(v6)?;
         keys.map_or(Ok(()), |k| k.apply(&socket))?;
@@ -400,7 +400,37 @@ macro_rules! call {
 #[cfg(test)]
 mod tests {
     use super::{Client, ClientError};
+    use crate::ipc::wire::{self, Reply, Request, reply};
+    use prost::Message as _;
     use std::time::{Duration, Instant};
+
+    #[test]
+    fn the_last_answer_of_a_daemon_that_goes_is_received() {
+        let directory = tempfile::tempdir().unwrap();
+        for round in 0..50 {
+            let uri = format!("ipc://{}/{round}", directory.path().display());
+            let (bound, wait) = std::sync::mpsc::channel();
+            let (there, uri) = (uri.clone(), uri);
+            let daemon = std::thread::spawn(move || {
+                let context = zmq::Context::new();
+                let socket = context.socket(zmq::ROUTER).unwrap();
+                socket.bind(&there).unwrap();
+                bound.send(()).unwrap();
+                let message = socket.recv_multipart(0).unwrap();
+                let request = Request::decode(message[1].as_slice()).unwrap();
+                let reply = Reply {
+                    request_id: request.request_id,
+                    result: Some(reply::Result::Hello(wire::HelloReply::default())),
+                };
+                let parts = [message[0].clone(), reply.encode_to_vec()];
+                socket.send_multipart(parts, 0).unwrap();
+            });
+            wait.recv().unwrap();
+            let mut client = Client::connect(&uri, Duration::from_secs(3)).unwrap();
+            assert!(client.hello().is_ok(), "round {round}");
+            daemon.join().unwrap();
+        }
+    }
 
     #[test]
     fn a_client_without_a_daemon_gives_up_in_time() {

@@ -68,18 +68,48 @@ impl Statistics {
         }
     }
 
-    /// The linear classifier these statistics make: pooled covariance with shrinkage, priors by area.
-    pub fn classifier(&self) -> Classifier {
+    /// Scatter of the descriptors within labels `(dim, dim)`: pooled covariance around the labels' means.
+    pub fn scatter_within(&self) -> DMatrix<f64> {
+        let mean = self.means();
+        let dim = mean.ncols();
+        let mut within = DMatrix::from_column_slice(dim, dim, &self.moment);
+        let scaled = DMatrix::from_fn(mean.nrows(), dim, |l, c| mean[(l, c)] * self.counts[l]);
+        within -= scaled.transpose() * &mean;
+        within / self.total().max(1e-300)
+    }
+
+    /// The same counts and means, with `share` of the scatter within labels taken from elsewhere.
+    pub fn with_scatter(&self, other: &DMatrix<f64>, share: f64) -> Self {
+        let weight = share * self.total();
+        let difference = (other - self.scatter_within()) * weight;
+        let mut mixed = self.clone();
+        mixed
+            .moment
+            .iter_mut()
+            .zip(difference.iter())
+            .for_each(|(m, d)| *m += d);
+        mixed
+    }
+
+    fn total(&self) -> f64 {
+        self.counts.iter().sum()
+    }
+
+    /// Mean descriptors of each label `(k, dim)`.
+    fn means(&self) -> DMatrix<f64> {
         let k = self.counts.len();
         let dim = self.sums.len() / k.max(1);
-        let total: f64 = self.counts.iter().sum();
-        let mean = DMatrix::from_fn(k, dim, |l, c| {
+        DMatrix::from_fn(k, dim, |l, c| {
             self.sums[l * dim + c] / self.counts[l].max(1e-12)
-        });
-        let mut within = DMatrix::from_column_slice(dim, dim, &self.moment);
-        let scaled = DMatrix::from_fn(k, dim, |l, c| mean[(l, c)] * self.counts[l]);
-        within -= scaled.transpose() * &mean;
-        within /= total.max(1e-300);
+        })
+    }
+
+    /// The linear classifier these statistics make: pooled covariance with shrinkage, priors by area.
+    pub fn classifier(&self) -> Classifier {
+        let mean = self.means();
+        let (k, dim) = mean.shape();
+        let total = self.total();
+        let mut within = self.scatter_within();
         let ridge = SHRINKAGE * within.trace() / dim as f64;
         within *= 1.0 - SHRINKAGE;
         for c in 0..dim {
@@ -116,6 +146,13 @@ pub struct Classifier {
 }
 
 impl Classifier {
+    /// The classifier at a temperature: scores are divided by it, so that above 1 it is less certain.
+    pub fn at_temperature(mut self, temperature: f64) -> Self {
+        let scores = self.weights.iter_mut().chain(&mut self.bias);
+        scores.for_each(|s| *s /= temperature);
+        self
+    }
+
     /// Log-probability of each label for each face `(m, k)`, row-major.
     pub fn log_probabilities(&self, features: &Features) -> Vec<f64> {
         let k = self.bias.len();
@@ -189,6 +226,31 @@ mod tests {
             p.chunks(3)
                 .all(|p| (p.iter().map(|v| v.exp()).sum::<f64>() - 1.0).abs() < 1e-9)
         );
+    }
+
+    #[test]
+    fn scatter_from_elsewhere_changes_the_scatter_alone() {
+        let (x, a, y) = blobs(1);
+        let one = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3);
+        let other = DMatrix::from_row_slice(2, 2, &[2.0, 0.5, 0.5, 1.0]);
+        let mixed = one.with_scatter(&other, 0.25);
+        assert_eq!((&mixed.counts, &mixed.sums), (&one.counts, &one.sums));
+        let expected = one.scatter_within() * 0.75 + other * 0.25;
+        assert!((mixed.scatter_within() - expected).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_high_temperature_makes_a_classifier_doubt() {
+        let (x, a, y) = blobs(1);
+        let sure = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3).classifier();
+        let cool = sure.log_probabilities(&x);
+        let warm = sure.at_temperature(2.0).log_probabilities(&x);
+        let most = |row: &[f64]| (0..3).max_by(|&a, &b| row[a].total_cmp(&row[b]));
+        for (cool, warm) in cool.chunks(3).zip(warm.chunks(3)) {
+            assert_eq!(most(cool), most(warm));
+            let top = |row: &[f64]| row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            assert!(top(warm) <= top(cool));
+        }
     }
 
     #[test]

@@ -145,6 +145,25 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     })
 }
 
+/// Mean over shapes of the area share whose predicted label *is* the true one, without an assignment: for labels that
+/// were named by example.
+pub fn accuracy_by_id(shapes: &[ScoredShape<'_>]) -> Result<f64, ScoreError> {
+    if shapes.is_empty() {
+        return Err(ScoreError::Empty);
+    }
+    let mut sum = 0.0;
+    for (i, shape) in shapes.iter().enumerate() {
+        let labels = shape.predicted.unwrap_or(&[]).iter().zip(shape.truth);
+        let shares = area_shares(i, shape)?;
+        sum += labels
+            .zip(shares)
+            .filter(|((p, t), _)| p == t)
+            .map(|(_, a)| a)
+            .sum::<f64>();
+    }
+    Ok(sum / shapes.len() as f64)
+}
+
 fn distinct<'a>(labels: impl Iterator<Item = &'a i32>) -> Vec<i32> {
     labels
         .copied()
@@ -246,7 +265,7 @@ fn root(parent: &mut [usize], mut i: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::{ScoreError, ScoredShape, pieces, rand_error, score};
+    use super::{ScoreError, ScoredShape, accuracy_by_id, pieces, rand_error, score};
     use crate::mesh::TriMesh;
 
     const TOLERANCE: f64 = 1e-12;
@@ -391,5 +410,21 @@ mod tests {
             predicted: None,
         };
         assert!(matches!(score(&[flat]), Err(ScoreError::Area { .. })));
+    }
+
+    #[test]
+    fn labels_named_by_example_are_compared_by_id() {
+        let mesh = strip(&[1.0, 2.0, 1.0]);
+        let truth = [0, 1, 1];
+        let shape = |predicted| ScoredShape {
+            mesh: &mesh,
+            truth: &truth,
+            predicted,
+        };
+        let swapped = accuracy_by_id(&[shape(Some(&[1, 0, 0]))]).unwrap();
+        let half = accuracy_by_id(&[shape(Some(&[0, 1, -1])), shape(None)]).unwrap();
+        assert!(swapped.abs() < TOLERANCE, "{swapped}");
+        assert!((half - 0.375).abs() < TOLERANCE, "{half}");
+        assert_eq!(accuracy_by_id(&[]), Err(ScoreError::Empty));
     }
 }

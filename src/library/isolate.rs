@@ -3,7 +3,7 @@
 //! Both ends are the same program, so nothing here has a version; lengths are checked all the same.
 
 use super::rows::{
-    format_from_name, format_name, from_json, operator_from_name, operator_name, report_from_json,
+    format_from_name, from_json, operator_from_name, operator_name, report_from_json,
     report_to_json, to_json,
 };
 use super::submit::refusal;
@@ -43,7 +43,7 @@ impl DescribeJob<'_> {
     /// Everything but the bytes.
     pub fn header(&self) -> Value {
         json!({
-            "format": format_name(self.format),
+            "format": self.format.name(),
             "operator": operator_name(self.params.operator),
             "working_faces": self.params.working_faces,
             "n_eigenpairs": self.params.n_eigenpairs,

@@ -120,18 +120,9 @@ pub(super) fn operator_from_name(name: &str, place: &str) -> Result<Operator> {
     found.ok_or_else(|| damaged(place, &format!("no operator is named {name:?}")))
 }
 
-/// The stored word of a format.
-pub(super) fn format_name(format: Format) -> &'static str {
-    match format {
-        Format::Obj => "obj",
-        Format::Off => "off",
-    }
-}
-
+/// The format of that stored word.
 pub(super) fn format_from_name(name: &str, place: &str) -> Result<Format> {
-    let found = [Format::Obj, Format::Off]
-        .into_iter()
-        .find(|f| format_name(*f) == name);
+    let found = Format::ALL.into_iter().find(|f| f.name() == name);
     found.ok_or_else(|| damaged(place, &format!("no format is named {name:?}")))
 }
 

@@ -3,7 +3,7 @@
 use super::collections::check_name;
 use super::isolate::DescribeJob;
 use super::jobs::Attempts;
-use super::rows::{damaged, format_from_name, format_name, from_json, operator_from_name, to_json};
+use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
 use super::{
     Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,
     NewShape, Outcome, Placed, RequestKey, Result,
@@ -35,7 +35,7 @@ impl Library {
         request.update(format!("submit {collection:?} {}", shapes.len()).as_bytes());
         for s in &shapes {
             check_name("shape", &s.name, MAX_SHAPE_NAME)?;
-            let what = format!("{:?} {} {}", s.name, format_name(s.format), s.replace);
+            let what = format!("{:?} {} {}", s.name, s.format.name(), s.replace);
             request
                 .update(what.as_bytes())
                 .update(&Digest::of(&s.bytes).0);
@@ -49,7 +49,7 @@ impl Library {
             items.push(NewJobItem {
                 name: s.name,
                 original_digest: object.digest,
-                format: format_name(s.format).into(),
+                format: s.format.name().into(),
                 replace: s.replace,
             });
             objects.push(object);
@@ -505,8 +505,11 @@ fn parse_subject(error: &ParseError) -> Option<FailureSubject> {
         | ParseError::ShortVertex { line, .. }
         | ParseError::EmptyFace { line, .. }
         | ParseError::ShortFace { line, .. }
+        | ParseError::BadLine { line, .. }
+        | ParseError::ShortRow { line, .. }
         | ParseError::Trailing { line, .. } => Some(FailureSubject::Line(*line as u64)),
         ParseError::PolygonTooLarge { face, .. }
+        | ParseError::EmptyPolygon { face }
         | ParseError::VertexOutOfRange { face, .. }
         | ParseError::NonFinite { face, .. } => Some(FailureSubject::Face(*face as u64)),
         _ => None,

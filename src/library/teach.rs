@@ -13,9 +13,10 @@ use super::rows::{Teaching, damaged, to_json};
 use super::{LabelId, Library, Result, Up};
 use crate::fmap::FunctionalMap;
 use crate::labels::{Features, LabelModel, Normalisation, Statistics, estimate_up};
-use crate::pipeline::{DescriptionView, Lesson, LessonMap, Prepared, TeachOptions, teach};
+use crate::pipeline::{DescriptionView, Given, Lesson, LessonMap, Prepared, TeachOptions, teach};
 use crate::segmentation::Surface;
 use crate::store::Tx;
+use nalgebra::DMatrix;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
@@ -218,7 +219,13 @@ impl Library {
                 residual: m.residual,
             })
             .collect();
-        let given = self.given(lane, &teaching, chosen, &model)?;
+        let statistics = self.given(lane, &teaching, chosen, &model)?;
+        let scatter = self.discovered_scatter(lane, &teaching, &model)?;
+        let given = Given {
+            statistics: &statistics,
+            n_exemplars: lane.shapes.iter().filter(|s| s.pinned).count(),
+            scatter: scatter.as_ref(),
+        };
         let taught = teach(&lessons, &maps, &given, k, &TeachOptions::default());
         model.statistics = taught.statistics;
         let learnt = Learnt::begin(model);
@@ -394,6 +401,45 @@ impl Library {
             }
         }
         Ok(given)
+    }
+
+    /// Scatter of the descriptors within the labels as they were when discovery ended, where those labels do not count
+    /// any more; `None` also if there were less than two.
+    fn discovered_scatter(
+        &self,
+        lane: &Lane,
+        teaching: &Teaching,
+        model: &LabelModel,
+    ) -> Result<Option<DMatrix<f64>>> {
+        let k = teaching.discovered_labels.len();
+        if !teaching.closed || k < 2 {
+            return Ok(None);
+        }
+        let mut discovered = Statistics::empty(k, model.normalisation.mean.len());
+        for (ordinal, version) in &teaching.discovered {
+            // Shapes may have been removed since, and old versions are not kept for ever.
+            let Some(shape) = lane.shapes.iter().find(|s| s.ordinal == *ordinal) else {
+                continue;
+            };
+            let old = self
+                .store
+                .catalog()
+                .read(|r| r.labels_at(shape.id, *version))?;
+            let Some(old) = old else {
+                continue;
+            };
+            let known = self.known(shape.id)?;
+            let prepared = Prepared::new(&known.mapped.view(), model);
+            let most = |f: usize| {
+                let row = &old.proxy_probabilities[f * k..(f + 1) * k];
+                let best = (0..k).max_by(|&a, &b| row[a].cmp(&row[b]).then(b.cmp(&a)));
+                best.map(|l| l as u32)
+            };
+            let (features, area) = (&prepared.features, &prepared.surface.area);
+            discovered.accumulate(&Statistics::of_shape(features, area, most, k), 1.0);
+        }
+        let any = discovered.counts.iter().any(|n| *n > 0.0);
+        Ok(any.then(|| discovered.scatter_within()))
     }
 }
 

@@ -53,10 +53,23 @@ pub enum Format {
     Obj,
     /// Object File Format.
     Off,
+    /// Polygon File Format, text or binary.
+    Ply,
+    /// STL, text or binary.
+    Stl,
+    /// glTF 2.0, JSON or binary (GLB).
+    Gltf,
 }
 
 impl Format {
-    /// The format a file name's extension says, in any case; `None` for any other extension.
+    /// All of them.
+    pub const ALL: [Self; 5] = [Self::Obj, Self::Off, Self::Ply, Self::Stl, Self::Gltf];
+
+    /// Extensions of file names, as messages list them.
+    pub const EXTENSIONS: &str = ".obj, .off, .ply, .stl, .glb, .gltf";
+
+    /// The format a file name's extension says, in any case; `None` for any other extension. Whether it is
+    /// text or binary the bytes say.
     pub fn from_name(file_name: &str) -> Option<Self> {
         let (stem, extension) = file_name.rsplit_once('.')?;
         if stem.is_empty() {
@@ -65,7 +78,21 @@ impl Format {
         match extension.to_ascii_lowercase().as_str() {
             "obj" => Some(Self::Obj),
             "off" => Some(Self::Off),
+            "ply" => Some(Self::Ply),
+            "stl" => Some(Self::Stl),
+            "glb" | "gltf" => Some(Self::Gltf),
             _ => None,
+        }
+    }
+
+    /// Its name in lower case.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Obj => "obj",
+            Self::Off => "off",
+            Self::Ply => "ply",
+            Self::Stl => "stl",
+            Self::Gltf => "gltf",
         }
     }
 }

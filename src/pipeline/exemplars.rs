@@ -7,11 +7,15 @@
 //! Word Sense Disambiguation Rivaling Supervised Methods*), and they vote for each other. What they have
 //! learnt labels every other shape with a vote and a cut: it does not change until the next correction, so the
 //! order in which those are labelled makes no difference.
+//!
+//! One exemplar shows what its parts are like, but not how much like parts of different shapes differ. That is taken from
+//! the labels that were discovered before: wrong as some are, descriptors scatter within them as within true parts.
 
 use super::place::{FLOOR, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::labels::cut::cut;
 use crate::labels::{Classifier, Statistics};
+use nalgebra::DMatrix;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 
 /// Weights of teaching.
@@ -30,6 +34,11 @@ pub struct TeachOptions {
     pub carried_weight: f64,
     /// Least probability of a face that the discriminant is trained on, if no person labelled it.
     pub confident: f64,
+    /// Exemplars that tell as much of how descriptors scatter within a label as the labels that were discovered: with n
+    /// of them, those have `scatter_exemplars / (scatter_exemplars + n)` of the say.
+    pub scatter_exemplars: f64,
+    /// Temperature of the discriminant, which is trained on few shapes and too certain.
+    pub temperature: f64,
     /// Boundary strength of the cut.
     pub strength: f64,
 }
@@ -43,6 +52,8 @@ impl Default for TeachOptions {
             pinned_weight: 4.0,
             carried_weight: 1.0,
             confident: 0.7,
+            scatter_exemplars: 2.0,
+            temperature: 2.0,
             strength: 3.0,
         }
     }
@@ -83,16 +94,32 @@ pub struct Taught {
     pub labellings: Vec<Labelling>,
 }
 
-/// Teaches the lessons `k` classes. `given` are statistics of faces that count besides those of the lessons: pinned
-/// ones of further exemplars, and discovered ones. Costs a cut for each lesson and round.
+/// What counts besides the lessons.
+#[derive(Debug, Clone, Copy)]
+pub struct Given<'a> {
+    /// Statistics of faces that were labelled: pinned ones of further exemplars, and discovered ones that still count.
+    pub statistics: &'a Statistics,
+    /// Exemplars, those among the lessons included.
+    pub n_exemplars: usize,
+    /// Scatter `(dim, dim)` within the labels that were discovered before anything was labelled, over many shapes: how
+    /// descriptors differ between like parts of different shapes, of which a few exemplars say little.
+    pub scatter: Option<&'a DMatrix<f64>>,
+}
+
+/// Teaches the lessons `k` classes. Costs a cut for each lesson and round.
 pub fn teach(
     lessons: &[Lesson<'_>],
     maps: &[LessonMap<'_>],
-    given: &Statistics,
+    given: &Given<'_>,
     k: usize,
     options: &TeachOptions,
 ) -> Taught {
-    let mut certain = given.clone();
+    let share = options.scatter_exemplars / (options.scatter_exemplars + given.n_exemplars as f64);
+    let with_scatter = |statistics: &Statistics| match given.scatter {
+        Some(scatter) => statistics.with_scatter(scatter, share),
+        None => statistics.clone(),
+    };
+    let mut certain = given.statistics.clone();
     for lesson in lessons.iter().filter(|l| !l.pinned.is_empty()) {
         let class = |f: usize| lesson.pinned[f];
         let of_shape = Statistics::of_shape(
@@ -104,10 +131,10 @@ pub fn teach(
         certain.accumulate(&of_shape, options.pinned_weight);
     }
     let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
-    let mut statistics = certain.clone();
+    let mut statistics = with_scatter(&certain);
     let mut labellings = Vec::new();
     for round in 0..=options.n_rounds {
-        let classifier = statistics.classifier();
+        let classifier = statistics.classifier().at_temperature(options.temperature);
         labellings = (0..lessons.len())
             .into_par_iter()
             .map(|to| {
@@ -144,7 +171,8 @@ pub fn teach(
             .collect();
         if round < options.n_rounds {
             votes = labellings.iter().map(|l| l.probabilities.clone()).collect();
-            statistics = with_confident(&certain, lessons, &labellings, k, options);
+            let more = with_confident(&certain, lessons, &labellings, k, options);
+            statistics = with_scatter(&more);
         }
     }
     Taught {
@@ -164,7 +192,7 @@ pub fn label_taught(
     options: &TeachOptions,
 ) -> Labelling {
     let evidence = Evidence {
-        classifier: &statistics.classifier(),
+        classifier: &statistics.classifier().at_temperature(options.temperature),
         votes,
         vote_share: options.vote_share,
         pinned,

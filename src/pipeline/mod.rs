@@ -10,7 +10,9 @@ pub use crate::description::{Description, DescriptionView, Params};
 pub use describe::{
     ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of,
 };
-pub use exemplars::{Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach};
+pub use exemplars::{
+    Given, Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach,
+};
 pub use place::{Labelling, Prepared, Vote, label, map};
 pub use recluster::{
     LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, batch, recluster,

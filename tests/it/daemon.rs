@@ -95,7 +95,13 @@ fn hello_tells_limits_formats_and_where_events_are() {
     assert_eq!(hello.event_endpoint, format!("{}.events", home.endpoint()));
     assert_eq!(
         hello.formats,
-        [wire::MeshFormat::Obj as i32, wire::MeshFormat::Off as i32]
+        [
+            wire::MeshFormat::Obj as i32,
+            wire::MeshFormat::Off as i32,
+            wire::MeshFormat::Ply as i32,
+            wire::MeshFormat::Stl as i32,
+            wire::MeshFormat::Gltf as i32,
+        ]
     );
     let limits = hello.limits.unwrap();
     assert_eq!(limits.max_message_bytes, 128 << 20);

@@ -5,6 +5,8 @@
 mod cli;
 mod correcting;
 mod daemon;
+mod formats;
+mod golden;
 mod harness;
 mod hostile;
 mod pipeline;

@@ -24,7 +24,15 @@ pub fn mesh_format(format: Format) -> wire::MeshFormat {
     match format {
         Format::Obj => wire::MeshFormat::Obj,
         Format::Off => wire::MeshFormat::Off,
+        Format::Ply => wire::MeshFormat::Ply,
+        Format::Stl => wire::MeshFormat::Stl,
+        Format::Gltf => wire::MeshFormat::Gltf,
     }
+}
+
+/// A format from the wire; `None` when it is not given, or one this version does not know.
+pub fn format_from_wire(format: wire::MeshFormat) -> Option<Format> {
+    Format::ALL.into_iter().find(|f| mesh_format(*f) == format)
 }
 
 /// The shapes of a request, in its order.
@@ -75,15 +83,12 @@ fn new_shape(
             ));
         }
         Some(shape_input::Source::Encoded(mesh)) => {
-            let format = match mesh.format() {
-                wire::MeshFormat::Obj => Format::Obj,
-                wire::MeshFormat::Off => Format::Off,
-                wire::MeshFormat::Unspecified => {
-                    let field = format!("{field}.encoded.format");
-                    let message = format!("{field} is {}, expected OBJ or OFF", mesh.format);
-                    return Err(field_error(ErrorReason::FieldRange, &field, message));
-                }
-            };
+            let format = format_from_wire(mesh.format()).ok_or_else(|| {
+                let field = format!("{field}.encoded.format");
+                let found = mesh.format;
+                let message = format!("{field} is {found}, expected OBJ, OFF, PLY, STL or GLTF");
+                field_error(ErrorReason::FieldRange, &field, message)
+            })?;
             let bytes = frames
                 .file(mesh.bytes.as_ref(), &format!("{field}.encoded.bytes"))
                 .map_err(|e| frame_error(&e))?;
@@ -99,7 +104,8 @@ fn new_shape(
         Some(shape_input::Source::Path(path)) => {
             let path = Path::new(path);
             let format = Format::from_name(&path.to_string_lossy()).ok_or_else(|| {
-                let message = format!("{} has no known mesh extension (obj, off)", path.display());
+                let (path, known) = (path.display(), Format::EXTENSIONS);
+                let message = format!("{path} has no known mesh extension ({known})");
                 field_error(ErrorReason::FieldRange, &format!("{field}.path"), message)
             })?;
             ((ingest.read_path)(path)?, format)

@@ -21,6 +21,7 @@ fn report(r: &CleanReport) -> wire::CleanReport {
         n_proxy_faces: r.n_proxy_faces as u64,
         n_proxy_vertices: r.n_proxy_vertices as u64,
         n_bridges: r.n_bridges as u64,
+        n_flipped_triangles: r.n_flipped_triangles as u64,
     }
 }
 

@@ -3,8 +3,12 @@
 //! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers) and
 //! says where; what is merely dirty (degenerate faces, unused vertices) it passes on to `clean`.
 
+mod gltf;
 mod obj;
 mod off;
+mod ply;
+mod stl;
+mod text;
 
 use super::{Format, ParsedMesh};
 
@@ -25,6 +29,8 @@ pub enum ParseError {
     ShortVertex { line: usize, found: usize },
     #[error("line {line}: face {face} has no corners, but at least 1 is needed")]
     EmptyFace { line: usize, face: usize },
+    #[error("face {face} has no corners, but at least 1 is needed")]
+    EmptyPolygon { face: usize },
     #[error("line {line}: face {face} has {found} corners, but declares {declared}")]
     ShortFace {
         line: usize,
@@ -47,10 +53,18 @@ pub enum ParseError {
     NonFinite { face: usize, position: [f64; 3] },
     #[error("the mesh has more than {MAX_TRIANGLES} triangles")]
     TooManyTriangles,
-    #[error("the file begins with \"{found}\", which is not an OFF header")]
-    BadHeader { found: String },
-    #[error("{what} is not read, only text in three dimensions")]
-    Unsupported { what: String },
+    #[error("the file begins with \"{found}\", which is not {format} header")]
+    BadHeader { found: String, format: &'static str },
+    #[error("line {line}: \"{found}\" is no line of a {what}")]
+    BadLine {
+        line: usize,
+        found: String,
+        what: &'static str,
+    },
+    #[error("the file has no {what}")]
+    Missing { what: &'static str },
+    #[error("{what} is not read, {instead}")]
+    Unsupported { what: String, instead: &'static str },
     #[error("the header declares {declared} {what}, but {n_bytes} bytes hold at most {limit}")]
     CountTooLarge {
         what: &'static str,
@@ -66,8 +80,22 @@ pub enum ParseError {
     },
     #[error("line {line} goes on after the {declared} faces the header declares")]
     Trailing { line: usize, declared: u64 },
-    #[error("the OBJ reader failed: {reason}")]
-    Reader { reason: String },
+    #[error("line {line} ends before all {declared} properties of its row are given")]
+    ShortRow { line: usize, declared: usize },
+    #[error("the file goes on for {n_bytes} bytes after what its header declares")]
+    TrailingBytes { n_bytes: usize },
+    #[error(
+        "the header declares {declared} triangles, which take {expected} bytes, but the file has {n_bytes}"
+    )]
+    StlLength {
+        declared: usize,
+        expected: u64,
+        n_bytes: usize,
+    },
+    #[error("the JSON is not that of a glTF file: {reason}")]
+    Json { reason: String },
+    #[error("{place} {why}")]
+    Gltf { place: String, why: String },
 }
 
 /// What the bytes of a file in `format` hold.
@@ -78,6 +106,9 @@ pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
     match format {
         Format::Obj => obj::parse(bytes),
         Format::Off => off::parse(bytes),
+        Format::Ply => ply::parse(bytes),
+        Format::Stl => stl::parse(bytes),
+        Format::Gltf => gltf::parse(bytes),
     }
 }
 
@@ -137,5 +168,11 @@ fn shown(token: &[u8]) -> String {
         .collect()
 }
 
+#[cfg(test)]
+mod gltf_tests;
+#[cfg(test)]
+mod hostile_tests;
+#[cfg(test)]
+mod ply_stl_tests;
 #[cfg(test)]
 mod tests;

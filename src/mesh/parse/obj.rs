@@ -1,132 +1,67 @@
-//! Wavefront OBJ: its `v` and `f` statements, read by `tobj`.
+//! Wavefront OBJ: its `v` and `f` statements.
 //!
-//! Only these two statements reach `tobj`, one clean line each, because given a whole file it
-//! - counts polylines (`l a b c`) as polygons and splits the polygons over groups and materials,
-//! - numbers vertices by first use and forgets the others,
-//! - knows neither continued lines nor comments behind a statement.
-//!
-//! A first polygon that names all vertices makes it keep the numbers of the file. A vertex's weight or
-//! colour and a corner's texture and normal indices are not geometry and are left out.
+//! Groups, objects and materials do not reorder anything; polylines and points are no faces. A vertex's
+//! weight or colour and a corner's texture and normal indices are not geometry and are left out. A face
+//! may name vertices that come after it, as many writers have it; a negative index counts back from the
+//! last vertex before the face.
 
-use super::{MAX_CORNERS, ParseError, Polygons, shown};
+use super::text::{Lines, before_comment, number, position, words};
+use super::{MAX_CORNERS, ParseError, Polygons};
 use crate::mesh::ParsedMesh;
 
-const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
-    triangulate: false,
-    single_index: false,
-    ignore_points: false,
-    ignore_lines: false,
-};
-
-/// The geometry of an OBJ file, as lines for `tobj`.
+/// What the statements so far say.
 #[derive(Default)]
 struct Geometry {
-    text: Vec<u8>,
-    /// Line of the file of each statement.
-    lines: Vec<usize>,
-    n_vertices: usize,
-    n_faces: usize,
+    vertices: Vec<[f64; 3]>,
+    /// Corners of all faces, from 0; checked against the number of vertices at the end.
+    corners: Vec<u32>,
+    /// Where each face's corners end.
+    ends: Vec<usize>,
 }
 
 impl Geometry {
     fn push(&mut self, statement: &[u8], line: usize) -> Result<(), ParseError> {
-        let mut tokens = statement
-            .split(|&b| b == b'#')
-            .next()
-            .unwrap_or_default()
-            .split(u8::is_ascii_whitespace)
-            .filter(|t| !t.is_empty());
-        match tokens.next() {
-            Some(b"v") => {
-                self.text.push(b'v');
-                let mut found = 0;
-                for token in tokens.take(3) {
-                    self.word(token, line)?;
-                    found += 1;
-                }
-                if found < 3 {
-                    return Err(ParseError::ShortVertex { line, found });
-                }
-                self.n_vertices += 1;
-            }
+        let mut words = words(before_comment(statement));
+        match words.next() {
+            Some(b"v") => self.vertices.push(position(line, &mut words)?),
             Some(b"f") => {
-                let face = self.n_faces;
-                self.text.push(b'f');
-                let mut corners = 0;
-                for token in tokens {
-                    let vertex = token.split(|&b| b == b'/').next().unwrap_or_default();
-                    self.word(vertex, line)?;
-                    corners += 1;
+                let face = self.ends.len();
+                let start = self.corners.len();
+                for word in words {
+                    let vertex = word.split(|&b| b == b'/').next().unwrap_or_default();
+                    let corner = self.corner(number(line, vertex)?, face)?;
+                    self.corners.push(corner);
                 }
-                if corners == 0 {
+                let found = self.corners.len() - start;
+                if found == 0 {
                     return Err(ParseError::EmptyFace { line, face });
                 }
-                if corners > MAX_CORNERS {
+                if found > MAX_CORNERS {
                     return Err(ParseError::PolygonTooLarge {
                         face,
-                        corners: corners as u64,
+                        corners: found as u64,
                     });
                 }
-                self.n_faces += 1;
+                self.ends.push(self.corners.len());
             }
-            _ => return Ok(()),
+            _ => {}
         }
-        self.text.push(b'\n');
-        self.lines.push(line);
         Ok(())
     }
 
-    /// Numbers are ASCII; anything else would make `tobj` refuse the line without saying which.
-    fn word(&mut self, token: &[u8], line: usize) -> Result<(), ParseError> {
-        if token.is_empty() || !token.is_ascii() {
-            return Err(ParseError::NotANumber {
-                line,
-                token: shown(token),
-            });
-        }
-        self.text.push(b' ');
-        self.text.extend_from_slice(token);
-        Ok(())
-    }
-
-    /// Where and why `tobj` refused the text; it says neither line nor face.
-    fn fault(&self, error: tobj::LoadError) -> ParseError {
-        let text = std::str::from_utf8(&self.text).unwrap_or_default();
-        let (mut n_seen, mut face) = (0_i64, 0);
-        let n_vertices = self.n_vertices;
-        for (statement, &line) in text.lines().zip(&self.lines) {
-            let mut words = statement.split_ascii_whitespace();
-            if words.next() == Some("v") {
-                n_seen += 1;
-                if let Some(token) = words.find(|t| t.parse::<f64>().is_err()) {
-                    return ParseError::NotANumber {
-                        line,
-                        token: shown(token.as_bytes()),
-                    };
-                }
-                continue;
-            }
-            for token in words {
-                let Ok(index) = token.parse::<i64>() else {
-                    return ParseError::NotANumber {
-                        line,
-                        token: shown(token.as_bytes()),
-                    };
-                };
-                let absolute = if index < 0 { n_seen + index } else { index - 1 };
-                if absolute < 0 || absolute >= n_vertices as i64 {
-                    return ParseError::VertexOutOfRange {
-                        face,
-                        vertex: index,
-                        n_vertices,
-                    };
-                }
-            }
-            face += 1;
-        }
-        ParseError::Reader {
-            reason: error.to_string(),
-        }
+    /// The vertex a corner names, from 0.
+    fn corner(&self, vertex: i64, face: usize) -> Result<u32, ParseError> {
+        let n_vertices = self.vertices.len();
+        let index = match vertex {
+            0 => None,
+            1.. => u32::try_from(vertex - 1).ok(),
+            _ => u32::try_from(n_vertices as i64 + vertex).ok(),
+        };
+        index.ok_or(ParseError::VertexOutOfRange {
+            face,
+            vertex,
+            n_vertices,
+        })
     }
 }
 
@@ -134,16 +69,16 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let mut geometry = Geometry::default();
     let mut joined: Vec<u8> = Vec::new();
     let mut first_line = 1;
-    for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
+    for (number, line) in Lines::new(bytes) {
         let line = line.trim_ascii_end();
         if joined.is_empty() {
-            first_line = number + 1;
+            first_line = number;
         }
         if let Some(head) = line.strip_suffix(b"\\") {
             joined.extend_from_slice(head);
             joined.push(b' ');
         } else if joined.is_empty() {
-            geometry.push(line, first_line)?;
+            geometry.push(line, number)?;
         } else {
             joined.extend_from_slice(line);
             geometry.push(&joined, first_line)?;
@@ -151,42 +86,21 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         }
     }
     geometry.push(&joined, first_line)?;
-    if geometry.n_faces == 0 {
-        return Err(ParseError::NoFaces);
-    }
 
-    let mut anchor = Vec::with_capacity(8 * geometry.n_vertices + 8);
-    anchor.push(b'f');
-    for vertex in 1..=geometry.n_vertices {
-        anchor.extend_from_slice(format!(" {vertex}").as_bytes());
-    }
-    anchor.push(b'\n');
-    let mut reader = std::io::Read::chain(anchor.as_slice(), geometry.text.as_slice());
-    let no_materials = |_: &_| Err(tobj::LoadError::OpenFileFailed);
-    let (models, _) = tobj::load_obj_buf(&mut reader, &OPTIONS, no_materials)
-        .map_err(|error| geometry.fault(error))?;
-    let [model] = models.as_slice() else {
-        return Err(ParseError::Reader {
-            reason: format!("{} models, not 1", models.len()),
-        });
-    };
-    let mesh = &model.mesh;
-    let (positions, _) = mesh.positions.as_chunks::<3>();
-    let mut polygons = Polygons::new(positions.to_vec());
-    // No arities means triangles only; then the anchor is one too.
-    let all_triangles = vec![3; mesh.indices.len() / 3];
-    let arities = if mesh.face_arities.is_empty() {
-        &all_triangles
-    } else {
-        &mesh.face_arities
-    };
-    let mut at = 0;
-    for (i, &arity) in arities.iter().enumerate() {
-        let corners = &mesh.indices[at..at + arity as usize];
-        at += arity as usize;
-        if i > 0 {
-            polygons.push(corners)?;
+    let n_vertices = geometry.vertices.len();
+    let mut polygons = Polygons::new(geometry.vertices);
+    let mut start = 0;
+    for (face, &end) in geometry.ends.iter().enumerate() {
+        let corners = &geometry.corners[start..end];
+        if let Some(&beyond) = corners.iter().find(|&&v| v as usize >= n_vertices) {
+            return Err(ParseError::VertexOutOfRange {
+                face,
+                vertex: i64::from(beyond) + 1,
+                n_vertices,
+            });
         }
+        polygons.push(corners)?;
+        start = end;
     }
     polygons.finish()
 }

@@ -4,38 +4,20 @@
 //! vertex or a face be told from what follows. Counts are checked against the bytes before anything is
 //! allocated.
 
+use super::text::{Lines, before_comment, number, position, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
 
 /// Shortest line of a vertex, `0 0 0`, and of a face, `1 0`, with their line end.
 const MIN_VERTEX_BYTES: usize = 6;
 const MIN_FACE_BYTES: usize = 4;
+const TEXT: &str = "only text in three dimensions";
 
-type Line<'a> = (usize, Vec<&'a [u8]>);
-
-/// Lines with their numbers, without comments and empty ones, split into words.
-fn lines(bytes: &[u8]) -> impl Iterator<Item = Line<'_>> {
-    bytes
-        .split(|&b| b == b'\n')
-        .enumerate()
-        .filter_map(|(i, line)| {
-            let code = line.split(|&b| b == b'#').next().unwrap_or_default();
-            let words: Vec<&[u8]> = code
-                .split(u8::is_ascii_whitespace)
-                .filter(|w| !w.is_empty())
-                .collect();
-            (!words.is_empty()).then_some((i + 1, words))
-        })
-}
-
-fn number<T: std::str::FromStr>(line: usize, token: &[u8]) -> Result<T, ParseError> {
-    std::str::from_utf8(token)
-        .ok()
-        .and_then(|t| t.parse().ok())
-        .ok_or_else(|| ParseError::NotANumber {
-            line,
-            token: shown(token),
-        })
+/// Lines with their numbers, without comments and empty ones.
+fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
+    Lines::new(bytes)
+        .map(|(number, line)| (number, before_comment(line)))
+        .filter(|(_, line)| words(line).next().is_some())
 }
 
 /// What follows the keyword on its line: counts, or nothing. `None` when the line is no header, as in
@@ -46,24 +28,21 @@ fn after_keyword<'a>(words: &[&'a [u8]]) -> Result<Option<Vec<&'a [u8]>>, ParseE
         return if first[0].is_ascii_digit() {
             Ok(None)
         } else {
-            Err(ParseError::BadHeader {
-                found: shown(first),
-            })
+            Err(bad_header(first))
         };
     };
     let prefix = &first[..at];
     if prefix.iter().any(|b| matches!(b, b'4' | b'n')) {
         return Err(ParseError::Unsupported {
             what: format!("{} with other dimensions", shown(first)),
+            instead: TEXT,
         });
     }
     let rest = prefix.strip_prefix(b"ST").unwrap_or(prefix);
     let rest = rest.strip_prefix(b"C").unwrap_or(rest);
     let rest = rest.strip_prefix(b"N").unwrap_or(rest);
     if !rest.is_empty() {
-        return Err(ParseError::BadHeader {
-            found: shown(first),
-        });
+        return Err(bad_header(first));
     }
     // Some writers leave out the line end: `OFF490 518 0`.
     let glued = &first[at + 3..];
@@ -78,6 +57,7 @@ fn after_keyword<'a>(words: &[&'a [u8]]) -> Result<Option<Vec<&'a [u8]>>, ParseE
     {
         return Err(ParseError::Unsupported {
             what: "binary OFF".into(),
+            instead: TEXT,
         });
     }
     Ok(Some(counts))
@@ -104,54 +84,53 @@ fn count(
     Ok(declared as usize)
 }
 
+fn bad_header(found: &[u8]) -> ParseError {
+    ParseError::BadHeader {
+        found: shown(found),
+        format: "an OFF",
+    }
+}
+
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
-    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     let mut lines = lines(bytes);
     let Some((mut line, first)) = lines.next() else {
-        return Err(ParseError::BadHeader {
-            found: String::new(),
-        });
+        return Err(bad_header(b""));
     };
+    let first: Vec<&[u8]> = words(first).collect();
     let mut counts = match after_keyword(&first)? {
         None => first,
         Some(counts) => counts,
     };
     if counts.is_empty() {
-        (line, counts) = lines.next().ok_or(ParseError::NoFaces)?;
+        let next = lines.next().ok_or(ParseError::NoFaces)?;
+        (line, counts) = (next.0, words(next.1).collect());
     }
     let Some(&[vertices, faces]) = counts.first_chunk::<2>() else {
-        return Err(ParseError::BadHeader {
-            found: shown(counts[0]),
-        });
+        return Err(bad_header(counts[0]));
     };
     let n_vertices = count("vertices", (line, vertices), bytes.len(), MIN_VERTEX_BYTES)?;
     let n_faces = count("faces", (line, faces), bytes.len(), MIN_FACE_BYTES)?;
 
     let mut positions = Vec::with_capacity(n_vertices);
     while positions.len() < n_vertices {
-        let (line, words) = lines.next().ok_or(ParseError::Truncated {
+        let (line, text) = lines.next().ok_or(ParseError::Truncated {
             what: "vertices",
             declared: n_vertices as u64,
             found: positions.len() as u64,
         })?;
-        let Some(&[x, y, z]) = words.first_chunk::<3>() else {
-            return Err(ParseError::ShortVertex {
-                line,
-                found: words.len(),
-            });
-        };
-        positions.push([number(line, x)?, number(line, y)?, number(line, z)?]);
+        positions.push(position(line, &mut words(text))?);
     }
 
     let mut polygons = Polygons::new(positions);
     let mut corners = Vec::new();
     for face in 0..n_faces {
-        let (line, words) = lines.next().ok_or(ParseError::Truncated {
+        let (line, text) = lines.next().ok_or(ParseError::Truncated {
             what: "faces",
             declared: n_faces as u64,
             found: face as u64,
         })?;
-        let declared: u64 = number(line, words[0])?;
+        let mut words = words(text);
+        let declared: u64 = number(line, words.next().unwrap_or_default())?;
         if declared == 0 {
             return Err(ParseError::EmptyFace { line, face });
         }
@@ -161,17 +140,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
                 corners: declared,
             });
         }
-        let found = words.len() - 1;
-        if (found as u64) < declared {
-            return Err(ParseError::ShortFace {
-                line,
-                face,
-                found,
-                declared,
-            });
-        }
         corners.clear();
-        for token in &words[1..=declared as usize] {
+        for token in words.take(declared as usize) {
             let vertex: i64 = number(line, token)?;
             if vertex < 0 || vertex >= n_vertices as i64 {
                 return Err(ParseError::VertexOutOfRange {
@@ -181,6 +151,14 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
                 });
             }
             corners.push(vertex as u32);
+        }
+        if (corners.len() as u64) < declared {
+            return Err(ParseError::ShortFace {
+                line,
+                face,
+                found: corners.len(),
+                declared,
+            });
         }
         polygons.push(&corners)?;
     }

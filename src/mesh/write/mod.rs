@@ -3,7 +3,14 @@
 //! Coordinates are written with as many digits as it takes to read the same number back; labels keep the
 //! order of the polygons.
 
+mod glb;
+mod usda;
+
+pub use glb::glb;
+pub use usda::usda;
+
 use super::TriMesh;
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// Object File Format text.
@@ -123,6 +130,49 @@ pub fn ply<P: AsRef<[u32]>>(
     out
 }
 
+/// An array of int32 `(n,)` as NumPy reads it (format version 1.0).
+pub fn npy(values: &[i32]) -> Vec<u8> {
+    // The data begin at a multiple of 64 bytes; magic, version and length take 10.
+    let mut header = format!(
+        "{{'descr': '<i4', 'fortran_order': False, 'shape': ({},), }}",
+        values.len()
+    );
+    while !(10 + header.len() + 1).is_multiple_of(64) {
+        header.push(' ');
+    }
+    header.push('\n');
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend_from_slice(&(header.len() as u16).to_le_bytes());
+    out.extend_from_slice(header.as_bytes());
+    out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    out
+}
+
+/// A label for each polygon, one a line, as in Princeton's `.seg` files.
+pub fn seg(labels: &[i32]) -> String {
+    let mut out = String::with_capacity(3 * labels.len());
+    for label in labels {
+        line(&mut out, format_args!("{label}"));
+    }
+    out
+}
+
+/// Polygons of each label, both ascending.
+fn by_label(labels: &[i32]) -> BTreeMap<i32, Vec<u32>> {
+    let mut groups: BTreeMap<i32, Vec<u32>> = BTreeMap::new();
+    for (polygon, &label) in (0..).zip(labels) {
+        groups.entry(label).or_default().push(polygon);
+    }
+    groups
+}
+
+/// First and count of each run of consecutive numbers.
+fn runs(ascending: &[u32]) -> impl Iterator<Item = (u32, usize)> {
+    ascending
+        .chunk_by(|a, b| *b == a + 1)
+        .map(|run| (run[0], run.len()))
+}
+
 fn line(out: &mut String, text: std::fmt::Arguments<'_>) {
     append(out, text);
     out.push('\n');
@@ -135,8 +185,8 @@ fn append(out: &mut String, text: std::fmt::Arguments<'_>) {
 
 #[cfg(test)]
 mod tests {
-    use super::{mtl, obj, off, ply};
-    use crate::mesh::TriMesh;
+    use super::{mtl, npy, obj, off, ply, runs, seg};
+    use crate::mesh::{Format, TriMesh, parse};
 
     fn two_triangles() -> TriMesh {
         TriMesh {
@@ -207,6 +257,38 @@ mod tests {
         assert_eq!(face[1..5], 2u32.to_le_bytes());
         assert_eq!(face[13..16], [4, 5, 6]);
         assert_eq!(face[16..20], (-1i32).to_le_bytes());
+    }
+
+    #[test]
+    fn what_is_written_our_own_readers_read() {
+        let mesh = two_triangles();
+        let polygons = [vec![0, 1, 2], vec![2, 1, 3], vec![0, 1, 3, 2]];
+        let name = |label: i32| format!("label_{label}");
+        let text = obj(&mesh.vertices, &polygons, &[4, 4, -1], name, "a.mtl");
+        let bytes = ply(&mesh.vertices, &polygons, &[[1, 2, 3]; 3], &[4, 4, -1]);
+        for (bytes, format) in [(text.into_bytes(), Format::Obj), (bytes, Format::Ply)] {
+            let read = parse(&bytes, format).unwrap();
+            assert_eq!(read.vertices, mesh.vertices);
+            assert_eq!(read.triangles, [[0, 1, 2], [2, 1, 3], [0, 1, 3], [0, 3, 2]]);
+            assert_eq!(read.polygon_of_triangle, [0, 1, 2, 2]);
+        }
+        let read = parse(off(&mesh).as_bytes(), Format::Off).unwrap();
+        assert_eq!((read.vertices, read.triangles), (mesh.vertices, mesh.faces));
+    }
+
+    #[test]
+    fn labels_alone_have_the_bytes_their_readers_expect() {
+        assert_eq!(seg(&[3, -1, 12]), "3\n-1\n12\n");
+        let bytes = npy(&[1, -1]);
+        assert_eq!(bytes.len(), 128 + 8);
+        assert_eq!(&bytes[..10], b"\x93NUMPY\x01\x00\x76\x00");
+        let header = std::str::from_utf8(&bytes[10..128]).unwrap();
+        assert!(header.starts_with("{'descr': '<i4', 'fortran_order': False, 'shape': (2,), }"));
+        assert!(header.ends_with(" \n"));
+        assert_eq!(bytes[128..], [1, 0, 0, 0, 255, 255, 255, 255]);
+        assert_eq!(npy(&[]).len(), 128);
+        let found: Vec<(u32, usize)> = runs(&[0, 1, 2, 5, 7, 8]).collect();
+        assert_eq!(found, [(0, 3), (5, 1), (7, 2)]);
     }
 
     #[test]

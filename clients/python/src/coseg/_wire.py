@@ -1,0 +1,338 @@
+"""Values become frames and frames become values; nothing here touches a socket."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from google.protobuf.message import Message
+from numpy.typing import ArrayLike, NDArray
+
+from coseg import types as t
+from coseg._link import Frame
+from coseg.errors import BadMesh, BadReply, Refused
+from coseg.v1 import (
+    analysis_pb2,
+    array_pb2,
+    collection_pb2,
+    daemon_pb2,
+    event_pb2,
+    job_pb2,
+    message_pb2,
+    shape_pb2,
+)
+
+_DTYPES: dict[int, np.dtype[Any]] = {
+    array_pb2.DATA_TYPE_INT32: np.dtype("<i4"),
+    array_pb2.DATA_TYPE_UINT32: np.dtype("<u4"),
+    array_pb2.DATA_TYPE_FLOAT32: np.dtype("<f4"),
+    array_pb2.DATA_TYPE_FLOAT64: np.dtype("<f8"),
+}
+_WIRE_DTYPES: dict[np.dtype[Any], Any] = {dtype: wire for wire, dtype in _DTYPES.items()}
+
+
+@runtime_checkable
+class HasFaces(Protocol):
+    """A mesh object, such as ``trimesh.Trimesh``."""
+
+    @property
+    def vertices(self) -> Any:
+        """(n, 3)."""
+
+    @property
+    def faces(self) -> Any:
+        """(m, 3)."""
+
+
+#: A mesh: the path of a file, the bytes of one, ``(vertices, faces)``, or an object that has both.
+Mesh = str | os.PathLike[str] | t.Encoded | tuple[ArrayLike, ArrayLike] | HasFaces
+
+
+class FrameWriter:
+    """Collects the raw frames of a request."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.n_bytes = 0
+
+    def file(self, data: bytes) -> array_pb2.BytesRef:
+        """Appends the bytes of a file."""
+        return array_pb2.BytesRef(frame=self._push(data))
+
+    def array(self, values: NDArray[Any]) -> array_pb2.ArrayRef:
+        """Appends an array of one of the protocol's types."""
+        dtype = values.dtype.newbyteorder("<")
+        flat = np.ascontiguousarray(values, dtype=dtype).reshape(-1).view(np.uint8)
+        frame = self._push(flat.data)
+        return array_pb2.ArrayRef(dtype=_WIRE_DTYPES[dtype], shape=values.shape, frame=frame)
+
+    def _push(self, frame: Frame) -> int:
+        self.frames.append(frame)
+        self.n_bytes += len(frame)
+        return len(self.frames) - 1
+
+
+def shape_input(name: str, mesh: Mesh, replace: bool, writer: FrameWriter) -> job_pb2.ShapeInput:
+    """A shape to add; its bytes go to ``writer``. Raises :class:`BadMesh` or :class:`OSError`."""
+    shape = job_pb2.ShapeInput(name=name, replace=replace)
+    if isinstance(mesh, str | os.PathLike):
+        path = Path(mesh)
+        mesh = t.Encoded(path.suffix.removeprefix(".").lower(), path.read_bytes())
+    if isinstance(mesh, t.Encoded):
+        shape.encoded.format = mesh_format(mesh.format)
+        shape.encoded.bytes.CopyFrom(writer.file(mesh.data))
+        return shape
+    if isinstance(mesh, tuple) and len(mesh) == 2:
+        vertices, faces = np.asarray(mesh[0]), np.asarray(mesh[1])
+    elif isinstance(mesh, HasFaces):
+        vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    else:
+        raise BadMesh(f"{name}: a {type(mesh).__name__} is no mesh")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+        raise BadMesh(f"{name}: vertices are {vertices.dtype}{vertices.shape}, expected real (n, 3)")
+    if faces.ndim != 2 or faces.shape[1] < 3 or faces.dtype.kind not in "iu":
+        raise BadMesh(f"{name}: faces are {faces.dtype}{faces.shape}, expected integer (m, d ≥ 3)")
+    if vertices.dtype != np.float32:
+        vertices = vertices.astype(np.float64)
+    if faces.size and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+        bad = faces.min() if faces.min() < 0 else faces.max()
+        raise BadMesh(f"{name}: a face names vertex {bad}, but the mesh has {len(vertices)}")
+    shape.arrays.vertices.CopyFrom(writer.array(vertices))
+    shape.arrays.faces.CopyFrom(writer.array(faces.astype(np.uint32, copy=False)))
+    return shape
+
+
+def mesh_format(name: str) -> Any:
+    """The format of that name or file extension."""
+    key = f"MESH_FORMAT_{name.upper()}"
+    if name.lower() == "unspecified" or key not in job_pb2.MeshFormat.keys():
+        known = ", ".join(n.removeprefix("MESH_FORMAT_").lower() for n in job_pb2.MeshFormat.keys()[1:])
+        raise BadMesh(f"{name!r} is no mesh format; known are {known}")
+    return job_pb2.MeshFormat.Value(key)
+
+
+def format_name(value: int) -> str:
+    """The name of a format, such as ``off``."""
+    return enum_name(job_pb2.MeshFormat, "MESH_FORMAT_", value)
+
+
+class Raw:
+    """The raw frames of a reply."""
+
+    def __init__(self, frames: Sequence[memoryview]) -> None:
+        self._frames = frames
+
+    def array(self, ref: array_pb2.ArrayRef) -> NDArray[Any]:
+        """An array, copied from its frame."""
+        dtype = _DTYPES.get(ref.dtype)
+        if dtype is None:
+            raise BadReply(f"an array has element type {ref.dtype}")
+        frame = self._frame(ref.frame)
+        shape = tuple(ref.shape)
+        if len(frame) != dtype.itemsize * int(np.prod(shape, dtype=object)):
+            raise BadReply(f"an array of shape {shape} and type {dtype} has {len(frame)} bytes")
+        values: NDArray[Any] = np.frombuffer(frame, dtype).reshape(shape)
+        return values.astype(dtype.newbyteorder("="))
+
+    def file(self, ref: array_pb2.BytesRef) -> bytes:
+        """The bytes of a file."""
+        return bytes(self._frame(ref.frame))
+
+    def _frame(self, index: int) -> memoryview:
+        if index >= len(self._frames):
+            raise BadReply(f"frame {index} is named, but the reply has {len(self._frames)}")
+        return self._frames[index]
+
+
+T = TypeVar("T")
+
+
+def flat(cls: type[T], message: Message, **others: object) -> T:
+    """A value of ``cls`` from the message's fields of the same names."""
+    values = dict(others)
+    for f in fields(cls):  # type: ignore[arg-type]
+        if f.name not in values:
+            value = getattr(message, f.name)
+            values[f.name] = (
+                tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+            )
+    return cls(**values)
+
+
+def enum_name(wrapper: Any, prefix: str, value: int) -> str:
+    """The name of an enum's value without its prefix, in lower case; a number if it is unknown."""
+    known = wrapper.DESCRIPTOR.values_by_number.get(value)
+    return str(known.name).removeprefix(prefix).lower() if known else str(value)
+
+
+def plain(message: Message) -> dict[str, object]:
+    """A message without arrays as plain values; what is optional and absent is ``None``."""
+    values: dict[str, object] = {}
+    for f in message.DESCRIPTOR.fields:
+        value = getattr(message, f.name)
+        if f.has_presence and not message.HasField(f.name):
+            values[f.name] = None
+        elif f.message_type is None:
+            values[f.name] = list(value) if f.is_repeated else value
+        elif f.is_repeated:
+            values[f.name] = [plain(v) for v in value]
+        else:
+            values[f.name] = plain(value)
+    return values
+
+
+# -- replies ------------------------------------------------------------------------------------
+
+
+def hello(reply: daemon_pb2.HelloReply) -> t.Hello:
+    """Who the daemon is."""
+    formats = tuple(map(format_name, reply.formats))
+    return flat(t.Hello, reply, formats=formats, limits=flat(t.Limits, reply.limits))
+
+
+def label(info: collection_pb2.LabelInfo) -> t.Label:
+    """A label."""
+    merged = info.merged_into if info.HasField("merged_into") else None
+    return flat(t.Label, info, merged_into=merged)
+
+
+def up_name(value: int) -> str:
+    """An axis as the command line writes it: ``+y``, ``unknown``, ``auto``."""
+    name = enum_name(collection_pb2.Up, "UP_", value)
+    return name.replace("plus_", "+").replace("minus_", "-")
+
+
+def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
+    """A collection."""
+    spec = message.spec
+    return flat(
+        t.CollectionInfo,
+        message,
+        name=spec.name,
+        n_parts=spec.n_parts,
+        up=up_name(spec.up),
+        operator=enum_name(collection_pb2.Operator, "OPERATOR_", spec.operator).replace("_", "-"),
+        working_faces=spec.working_faces,
+        labels=tuple(map(label, message.labels)),
+    )
+
+
+def collection_spec(
+    name: str, parts: int | None, up: str | None, operator: str | None, working_faces: int
+) -> collection_pb2.CollectionSpec:
+    """What a collection is created with."""
+    spec = collection_pb2.CollectionSpec(name=name, working_faces=working_faces)
+    if parts is not None:
+        spec.n_parts = parts
+    if up is not None:
+        key = "UP_" + up.upper().replace("+", "PLUS_").replace("-", "MINUS_")
+        spec.up = _value(collection_pb2.Up, key, f"up is {up!r}")
+    if operator is not None:
+        key = "OPERATOR_" + operator.upper().replace("-", "_")
+        spec.operator = _value(collection_pb2.Operator, key, f"operator is {operator!r}")
+    return spec
+
+
+def _value(wrapper: Any, key: str, what: str) -> Any:
+    if key not in wrapper.keys() or key.endswith("_UNSPECIFIED"):
+        raise ValueError(f"{what}, which is none of its values")
+    return wrapper.Value(key)
+
+
+def shape(message: shape_pb2.Shape) -> t.Shape:
+    """A shape."""
+    return flat(
+        t.Shape,
+        message,
+        report=plain(message.report),
+        parts=tuple(flat(t.Part, p) for p in message.parts),
+        sources=tuple(flat(t.Source, s) for s in message.sources),
+    )
+
+
+def item(message: job_pb2.JobItem) -> t.JobItem:
+    """One shape of a job."""
+    state = enum_name(job_pb2.ItemState, "ITEM_STATE_", message.state)
+    result = None
+    if state == "done":
+        placed = message.placed
+        result = t.Added(
+            message.name,
+            enum_name(job_pb2.Outcome, "OUTCOME_", placed.outcome),
+            version=placed.version,
+            sequence=placed.sequence,
+            n_maps=placed.n_maps,
+            n_relabelled=placed.n_relabelled,
+            stages={s.stage: s.ms for s in placed.stages},
+        )
+    elif state in ("failed", "cancelled"):
+        error = Refused.from_wire(message.error) if message.HasField("error") else None
+        result = t.Added(message.name, state, error=error)
+    return t.JobItem(message.name, state, message.stage, result)
+
+
+def job(message: job_pb2.Job) -> t.Job:
+    """A job."""
+    return flat(t.Job, message, id=message.job_id, items=tuple(map(item, message.items)))
+
+
+def labelling(reply: shape_pb2.GetLabelsReply, raw: Raw) -> t.Labelling:
+    """The labels of a shape."""
+    confidence = raw.array(reply.confidence) if reply.HasField("confidence") else None
+    return t.Labelling(reply.version, raw.array(reply.labels), confidence)
+
+
+def snapshot(reply: shape_pb2.LabelsSnapshotReply, raw: Raw) -> t.Snapshot:
+    """The labels of all shapes."""
+    shapes = {s.shape: t.Labelling(s.version, raw.array(s.labels)) for s in reply.shapes}
+    return t.Snapshot(reply.sequence, shapes)
+
+
+def spectrum(reply: analysis_pb2.GetSpectrumReply, raw: Raw) -> t.Spectrum:
+    """Eigenpairs."""
+    return t.Spectrum(
+        raw.array(reply.eigenvalues),
+        raw.array(reply.eigenvectors) if reply.HasField("eigenvectors") else None,
+        raw.array(reply.mass) if reply.HasField("mass") else None,
+        reply.area,
+    )
+
+
+def descriptors(reply: analysis_pb2.GetDescriptorsReply, raw: Raw) -> t.Descriptors:
+    """The working mesh and its descriptors."""
+    return t.Descriptors(**{f.name: raw.array(getattr(reply, f.name)) for f in fields(t.Descriptors)})
+
+
+def functional_map(
+    source: str, target: str, reply: analysis_pb2.GetFunctionalMapReply, raw: Raw
+) -> t.FunctionalMap:
+    """A functional map."""
+    quality = flat(t.MapQuality, reply.quality)
+    return t.FunctionalMap(source, target, raw.array(reply.c_12), raw.array(reply.p2p_21), quality)
+
+
+def part_matches(reply: analysis_pb2.GetPartCorrespondenceReply) -> t.PartMatches:
+    """Matching parts."""
+    matches = tuple(flat(t.PartMatch, m) for m in reply.matches)
+    return t.PartMatches(matches, flat(t.MapQuality, reply.quality))
+
+
+def event(message: event_pb2.Event) -> t.Event:
+    """An event."""
+    kind = message.WhichOneof("kind")
+    data: Mapping[str, object] = plain(getattr(message, kind)) if kind else {}
+    return t.Event(message.sequence, message.collection, kind or "unknown", data)
+
+
+def result(reply: message_pb2.Reply, body: str) -> Any:
+    """The result of the reply to a request with that body; a refusal is raised."""
+    kind = reply.WhichOneof("result")
+    if kind == "error":
+        raise Refused.from_wire(reply.error)
+    if kind != body:
+        raise BadReply(f"the reply to {body} has {kind or 'no result'}")
+    return getattr(reply, body)

@@ -1,0 +1,362 @@
+"""What the daemon tells, as plain values. Arrays are numpy arrays of the caller's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int32 = NDArray[np.int32]
+UInt32 = NDArray[np.uint32]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Element = TypeVar("Element", bound=np.generic)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the daemon refuses beyond."""
+
+    max_message_bytes: int
+    max_frames: int
+    max_header_bytes: int
+    max_shapes_per_request: int
+    max_shape_bytes: int
+    max_queued_shapes: int
+    max_page: int
+    max_wait_ms: int
+    max_id_chars: int
+
+
+@dataclass(frozen=True)
+class Hello:
+    """Who the daemon is."""
+
+    version: str
+    protocol: str
+    #: Differs between any two starts of a daemon.
+    instance: str
+    event_endpoint: str
+    #: File formats it reads, such as ``"off"``.
+    formats: tuple[str, ...]
+    capabilities: tuple[str, ...]
+    limits: Limits
+
+
+@dataclass(frozen=True)
+class Label:
+    """A label of a collection."""
+
+    id: int
+    #: The name a person gave; empty: none.
+    name: str
+    #: sRGB colour, 0xRRGGBB.
+    colour_rgb: int
+    #: The label this one was merged into; ``None`` while it is in use.
+    merged_into: int | None
+    #: Shapes that carry it; 0: out of use.
+    n_shapes: int
+
+
+@dataclass(frozen=True)
+class CollectionInfo:
+    """A collection as it stands."""
+
+    name: str
+    #: Number of part kinds; 0: estimated.
+    n_parts: int
+    up: str
+    operator: str
+    working_faces: int
+    #: Number of its newest event.
+    sequence: int
+    n_shapes: int
+    #: Shapes whose labels wait to be recomputed.
+    n_stale: int
+    labels: tuple[Label, ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A connected piece of a shape with one label."""
+
+    label: int
+    area_share: float
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Source:
+    """A shape that labels were carried from."""
+
+    shape: str
+    version: int
+    weight: float
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shape as it stands."""
+
+    name: str
+    #: Position in the order of arrival, from 1; never reused.
+    ordinal: int
+    #: Version of its labels, from 1.
+    version: int
+    #: Whether its labels wait to be recomputed.
+    stale: bool
+    #: Polygons of the input.
+    n_polygons: int
+    area: float
+    #: BLAKE3 of the original bytes, hexadecimal.
+    content_digest: str
+    stored_bytes: int
+    #: What cleaning found and did: counts by name, such as ``"n_boundary_edges"``.
+    report: Mapping[str, object]
+    parts: tuple[Part, ...]
+    sources: tuple[Source, ...]
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """The labels of a shape, one for each face of its file, in the file's order."""
+
+    version: int
+    #: (n_polygons,) label, −1: unlabelled.
+    labels: Int32
+    #: (n_polygons,) probability of the label, if it was asked for.
+    confidence: Float32 | None = None
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """The bytes of a mesh file and their format, such as ``"off"``."""
+
+    format: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Added:
+    """What became of one shape that was added."""
+
+    name: str
+    #: ``"added"``, ``"unchanged"``, ``"replaced"``, ``"failed"`` or ``"cancelled"``.
+    outcome: str
+    #: Why it failed.
+    error: Exception | None = None
+    #: Version of its labels.
+    version: int = 0
+    #: Number of the collection's newest event after it.
+    sequence: int = 0
+    #: Functional maps that were computed for it.
+    n_maps: int = 0
+    #: Stored shapes whose labels were recomputed with it.
+    n_relabelled: int = 0
+    #: Milliseconds by stage, in order.
+    stages: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the shape is in the collection."""
+        return self.outcome in ("added", "unchanged", "replaced")
+
+
+@dataclass(frozen=True)
+class JobItem:
+    """One shape of a job."""
+
+    name: str
+    #: ``"queued"``, ``"running"``, ``"done"``, ``"failed"`` or ``"cancelled"``.
+    state: str
+    #: While it is running: the stage.
+    stage: str
+    #: When it is over: what became of it.
+    result: Added | None
+
+
+@dataclass(frozen=True)
+class Job:
+    """Shapes that were accepted together."""
+
+    id: int
+    collection: str
+    items: tuple[JobItem, ...]
+    #: Changes with every change of the job.
+    revision: int
+    finished: bool
+    #: Share that is done, 0 to 1.
+    progress: float
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenpairs of W φ = λ A φ on a shape's working mesh, scaled to area 1."""
+
+    #: (k,) ascending, 0 included. In input units: divide by ``area``.
+    eigenvalues: Float64
+    #: (n, b) the first b ≤ k eigenvectors as columns, mass-orthonormal.
+    eigenvectors: Float32 | None
+    #: (n,) lumped mass of each vertex; sums to 1.
+    mass: Float32 | None
+    #: Surface area in squared input units.
+    area: float
+
+
+@dataclass(frozen=True)
+class Descriptors:
+    """The working mesh of a shape and what its segmentation is computed from."""
+
+    #: (n, 3) centred, total area 1, in the input's orientation.
+    vertices: Float32
+    #: (m, 3).
+    faces: UInt32
+    #: (m, d).
+    face_descriptors: Float32
+    #: (m,) patch of each face.
+    patches: UInt32
+    #: (n_polygons,) for each polygon of the input its face here.
+    face_map: UInt32
+    #: (n_polygons,) share of the total area of each polygon of the input.
+    polygon_area: Float32
+    #: (g,) by which neighbours are ranked.
+    signature: Float32
+
+
+@dataclass(frozen=True)
+class MapQuality:
+    """How good a functional map is."""
+
+    #: Mean squared descriptor difference between matched vertices.
+    descriptor_residual: float
+    #: ‖CᵀC − I‖ / √k; 0 for an isometry.
+    orthogonality: float
+    #: Share of the source's area that is hit.
+    coverage: float
+    #: Share of the entries of C with magnitude below 0.1.
+    near_zero: float
+
+
+@dataclass(frozen=True)
+class FunctionalMap:
+    """The map that carries functions on shape 1 to functions on shape 2."""
+
+    source: str
+    target: str
+    #: (k2, k1) coefficients on shape 1 to coefficients on shape 2, in the bases of ``spectrum``.
+    c_12: Float32
+    #: (n2,) for each vertex of shape 2's working mesh one of shape 1's.
+    p2p_21: UInt32
+    quality: MapQuality
+
+    def carry(self, values: NDArray[Element]) -> NDArray[Element]:
+        """Carries values at vertices of shape 1, (n1, …), to those of shape 2, (n2, …)."""
+        carried: NDArray[Element] = values[self.p2p_21]
+        return carried
+
+
+@dataclass(frozen=True)
+class PartMatch:
+    """A pair of matching parts: indices into ``Shape.parts``, and their labels."""
+
+    part_a: int
+    part_b: int
+    label_a: int
+    label_b: int
+    #: Intersection over union of their areas under the map.
+    overlap: float
+
+
+@dataclass(frozen=True)
+class PartMatches:
+    """Matching parts, largest overlap first, and how good the map is that says so."""
+
+    matches: tuple[PartMatch, ...]
+    quality: MapQuality
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    """A shape and how far it is; 0: equal."""
+
+    shape: str
+    distance: float
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A correction that is durable."""
+
+    version: int
+    sequence: int
+    #: Faces of the shape that a person labelled, now or before, and the share of its area.
+    n_faces: int
+    area_share: float
+    #: Share of its area whose label changed.
+    changed_share: float
+    #: Shapes to which it is still to be carried.
+    n_stale: int
+
+
+@dataclass(frozen=True)
+class Undone:
+    """What was undone: ``"correct"``, ``"name"``, ``"merge"`` or ``"split"``."""
+
+    change: str
+    #: Changes that can still be undone.
+    n_left: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """The shape whose labelling by a person would help most."""
+
+    shape: str
+    #: Relative to the other shapes; 1 is the mean.
+    gain: float
+    #: Share of its area whose label is uncertain.
+    uncertainty: float
+    n_nearest: int
+    reason: str
+    n_corrected: int
+
+
+@dataclass(frozen=True)
+class Idle:
+    """Whether a collection has anything left to do."""
+
+    idle: bool
+    n_queued: int
+    n_stale: int
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The labels of all shapes of a collection as of one moment, by name."""
+
+    #: Events with a larger number come on top.
+    sequence: int
+    shapes: Mapping[str, Labelling]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a collection."""
+
+    #: Position in the collection's log, from 1, without gaps.
+    sequence: int
+    collection: str
+    #: Name of the kind, such as ``"labels_changed"``.
+    kind: str
+    #: The fields of the kind as plain values, such as ``{"shape": "101", "version": 2, …}``.
+    data: Mapping[str, object]
+
+    @property
+    def shape(self) -> str | None:
+        """The shape it is about."""
+        name = self.data.get("shape")
+        return name if isinstance(name, str) else None

@@ -1,0 +1,42 @@
+"""Writes made shapes in the formats that coseg reads, by other programs' writers: make.py FROM TO."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from plyfile import PlyData, PlyElement
+
+source, target = map(Path, sys.argv[1:])
+target.mkdir(parents=True, exist_ok=True)
+one, two, three = [trimesh.load(p, process=False) for p in sorted(source.glob("*.off"))]
+
+one.export(target / "off.off")
+one.export(target / "stl-binary.stl")
+two.export(target / "stl-text.stl", file_type="stl_ascii")
+two.export(target / "ply-little.ply", encoding="binary")
+three.export(target / "ply-text.ply", encoding="ascii")
+three.export(target / "obj.obj")
+
+vertices = np.array([tuple(v) for v in three.vertices], dtype=[(c, "f8") for c in "xyz"])
+faces = np.empty(len(three.faces), dtype=[("vertex_indices", "i4", (3,))])
+faces["vertex_indices"] = three.faces
+elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+PlyData(elements, byte_order=">").write(str(target / "ply-big.ply"))
+
+# A scene of two nodes that place the same mesh, one mirrored, and a third mesh.
+scene = trimesh.Scene()
+scene.add_geometry(one, node_name="here", geom_name="chair")
+scene.graph.update("there", matrix=np.diag([-1.0, 1, 1, 1]) @ trimesh.transformations.translation_matrix([2, 0, 0]), geometry="chair")
+scene.add_geometry(trimesh.creation.box(), node_name="box", transform=trimesh.transformations.translation_matrix([0, 3, 0]))
+scene.export(target / "scene.glb")
+
+# Quads, as modellers draw them: a table of five boxes.
+lines, n = [], 0
+for low, high in [((0, 9, 0), (20, 10, 20))] + [((x, 0, z), (x + 2, 9, z + 2)) for x in (0, 18) for z in (0, 18)]:
+    for i in range(8):
+        lines.append("v %g %g %g" % tuple(high[k] if i >> k & 1 else low[k] for k in range(3)))
+    for quad in [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]:
+        lines.append("f " + " ".join(str(n + c + 1) for c in quad))
+    n += 8
+(target / "quads.obj").write_text("\n".join(lines) + "\n")

@@ -1,0 +1,305 @@
+//! Files of every format in, labels in every format out, and what is found in the wild.
+
+use crate::harness::{Home, SKITTLE_FACES, json, skittle, stdout};
+use coseg::library::{CollectionSpec, LibraryError, NewShape};
+use coseg::mesh::{Format, ParsedMesh, parse, write};
+use coseg::{Library, synth};
+use std::path::{Path, PathBuf};
+
+fn read(path: impl AsRef<Path>) -> Vec<u8> {
+    let path = path.as_ref();
+    std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The same skittle in every format, by file name.
+fn in_every_format() -> Vec<(&'static str, Vec<u8>)> {
+    let text = skittle(1);
+    let mesh = parse(text.as_bytes(), Format::Off).unwrap();
+    let (vertices, faces) = (&mesh.vertices, &mesh.triangles);
+    let labels = vec![0; faces.len()];
+    let obj = write::obj(vertices, faces, &labels, |_| "all".to_owned(), "none.mtl");
+    let ply = write::ply(vertices, faces, &vec![[0; 3]; faces.len()], &labels);
+    let glb = write::glb("g", vertices, faces, &labels, |_| {
+        ("all".to_owned(), [0; 3])
+    });
+    let mut stl = vec![0; 80];
+    stl.extend_from_slice(&(faces.len() as u32).to_le_bytes());
+    for face in faces {
+        stl.extend_from_slice(&[0; 12]);
+        let numbers = face.iter().flat_map(|&v| vertices[v as usize]);
+        stl.extend(numbers.flat_map(|x| (x as f32).to_le_bytes()));
+        stl.extend_from_slice(&[0; 2]);
+    }
+    vec![
+        ("a.off", text.into_bytes()),
+        ("b.obj", obj.into_bytes()),
+        ("c.ply", ply),
+        ("d.stl", stl),
+        ("e.glb", glb),
+    ]
+}
+
+#[test]
+fn every_format_comes_in_and_goes_out_with_its_labels() {
+    let home = Home::new();
+    let folder = home.path("meshes");
+    std::fs::create_dir(&folder).unwrap();
+    for (name, bytes) in in_every_format() {
+        std::fs::write(folder.join(name), bytes).unwrap();
+    }
+    let _daemon = home.start();
+    let folder = folder.display().to_string();
+    let added = json(&home.coseg(&["add", &folder, "--parts", "2", "--json"]), 0);
+    assert_eq!(added["n_added"], 5, "{added}");
+    let out = home.path("out");
+    let directory = out.display().to_string();
+    for format in ["labels", "seg", "npy", "json", "ply", "obj", "glb", "usda"] {
+        stdout(
+            &home.coseg(&["export", "--format", format, "--out", &directory]),
+            0,
+        );
+    }
+    for name in ["a", "b", "c", "d", "e"] {
+        let labels: Vec<i32> = stdout(&home.coseg(&["labels", name]), 0)
+            .lines()
+            .map(|l| l.parse().unwrap())
+            .collect();
+        assert_eq!(labels.len(), SKITTLE_FACES);
+        assert!(labels.iter().any(|l| *l != labels[0]), "{name}: {labels:?}");
+        let file = |ending: &str| read(out.join(format!("{name}{ending}")));
+        assert_eq!(file(".seg"), file(".labels.txt"));
+        assert_eq!(file(".seg"), write::seg(&labels).into_bytes());
+        assert_eq!(file(".labels.npy"), write::npy(&labels));
+        let value: serde_json::Value = serde_json::from_slice(&file(".labels.json")).unwrap();
+        assert_eq!(value["labels"], serde_json::json!(labels));
+        assert_eq!(value["names"]["-1"], "unlabelled");
+
+        // The meshes have the faces of the file, in its order, but for GLB.
+        let original = home.path("meshes").join(match name {
+            "a" => "a.off",
+            "b" => "b.obj",
+            "c" => "c.ply",
+            "d" => "d.stl",
+            _ => "e.glb",
+        });
+        let format = Format::from_name(&original.to_string_lossy()).unwrap();
+        let whole = parse(&read(original), format).unwrap();
+        for (ending, format) in [(".ply", Format::Ply), (".obj", Format::Obj)] {
+            assert_eq!(
+                parse(&file(ending), format).unwrap(),
+                whole,
+                "{name}{ending}"
+            );
+        }
+        // The label is what a face's record ends with.
+        let ply = file(".ply");
+        let records = &ply[ply.len() - 20 * SKITTLE_FACES..];
+        let of_records = records
+            .chunks(20)
+            .map(|r| i32::from_le_bytes(r[16..].try_into().unwrap()));
+        assert!(of_records.eq(labels.iter().copied()));
+        let of_obj = labels_of_obj(&String::from_utf8(file(".obj")).unwrap());
+        assert_eq!(of_obj, labels);
+        let found = parse(&file(".glb"), Format::Gltf).unwrap();
+        assert_eq!(labels_of_glb(&file(".glb"), &found, &whole), labels);
+        let usda = String::from_utf8(file(".usda")).unwrap();
+        let listed: Vec<String> = labels.iter().map(i32::to_string).collect();
+        let line = format!("int[] primvars:label = [{}] (", listed.join(", "));
+        assert!(usda.contains(&line));
+    }
+}
+
+/// Labels by the groups that faces are in.
+fn labels_of_obj(text: &str) -> Vec<i32> {
+    let mut label = -1;
+    let mut labels = Vec::new();
+    for line in text.lines() {
+        if let Some(name) = line.strip_prefix("usemtl label_") {
+            label = name.parse().unwrap();
+        } else if line.starts_with("f ") {
+            labels.push(label);
+        }
+    }
+    labels
+}
+
+/// Labels by what a GLB's primitives say of the polygons they have; their triangles must be the original's.
+fn labels_of_glb(bytes: &[u8], found: &ParsedMesh, original: &ParsedMesh) -> Vec<i32> {
+    let n_json = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let root: serde_json::Value = serde_json::from_slice(&bytes[20..20 + n_json]).unwrap();
+    let mut labels = vec![i32::MIN; original.n_polygons];
+    let mut triangles = found.triangles.iter();
+    for primitive in root["meshes"][0]["primitives"].as_array().unwrap() {
+        let extras = &primitive["extras"];
+        let label = extras["label"].as_i64().unwrap() as i32;
+        let material = primitive["material"].as_u64().unwrap() as usize;
+        assert_eq!(
+            root["materials"][material]["name"],
+            format!("label_{label}")
+        );
+        let runs: Vec<usize> = serde_json::from_value(extras["polygons"].clone()).unwrap();
+        for run in runs.chunks(2) {
+            let polygons = run[0]..run[0] + run[1];
+            labels[polygons.clone()].fill(label);
+            for polygon in polygons {
+                assert_eq!(triangles.next(), Some(&original.triangles[polygon]));
+            }
+        }
+    }
+    labels
+}
+
+fn library() -> (tempfile::TempDir, Library) {
+    let folder = tempfile::tempdir().unwrap();
+    let library = Library::open(folder.path()).unwrap();
+    let spec = CollectionSpec {
+        name: "all".into(),
+        n_parts: Some(3),
+        ..CollectionSpec::default()
+    };
+    library.create_collection(&spec, None).unwrap();
+    (folder, library)
+}
+
+fn add(library: &Library, name: &str, bytes: Vec<u8>, format: Format) -> Result<(), LibraryError> {
+    let shape = NewShape {
+        name: name.into(),
+        bytes,
+        format,
+        replace: false,
+    };
+    library.add("all", shape).map(|_| ())
+}
+
+fn files(folder: &Path, into: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files(&path, into);
+        } else {
+            into.push(path);
+        }
+    }
+}
+
+#[test]
+fn every_messy_file_is_labelled_or_refused_with_a_reason() {
+    let Some(data) = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from) else {
+        println!("skipped: COSEG_TEST_DATA is not set");
+        return;
+    };
+    let mut paths = Vec::new();
+    files(&data.join("messy"), &mut paths);
+    paths.sort();
+    let (_folder, library) = library();
+    let mut n_labelled = 0;
+    for (i, path) in paths.iter().enumerate() {
+        let file = path.file_name().unwrap().to_string_lossy();
+        let format = Format::from_name(&file).unwrap_or_else(|| panic!("{file} is no mesh"));
+        let name = format!("{i}");
+        match add(&library, &name, read(path), format) {
+            Ok(()) => {
+                n_labelled += 1;
+                let labels = library.labels("all", &name, None).unwrap().labels;
+                let n = parse(&read(path), format).unwrap().n_polygons;
+                assert_eq!(labels.len(), n, "{file}");
+                assert!(
+                    labels.iter().all(|l| *l >= 0),
+                    "{file} has unlabelled faces"
+                );
+                let report = library.shape("all", &name).unwrap().report;
+                println!("{file}: labelled, {report:?}");
+            }
+            Err(LibraryError::Refused(why)) => println!("{file}: refused, {}", why.message),
+            Err(e) => panic!("{file}: {e}"),
+        }
+    }
+    // All that are there can be labelled.
+    assert_eq!(n_labelled, paths.len());
+}
+
+/// A chair whose parts are loose pieces, each closed, is one shape: pieces are joined for the analysis,
+/// reported, and labelled as those of a chair that is all of one piece.
+#[test]
+fn a_chair_of_loose_pieces_is_one_shape() {
+    let (_folder, library) = library();
+    let pieces = |shift: f64| {
+        let boards: [([f64; 3], [f64; 3]); 8] = [
+            ([0.0, 0.0, 0.0], [0.1, 1.0, 0.1]),
+            ([0.9, 0.0, 0.0], [1.0, 1.0, 0.1]),
+            ([0.0, 0.0, 0.9], [0.1, 1.0, 1.0]),
+            ([0.9, 0.0, 0.9], [1.0, 1.0, 1.0]),
+            ([0.0, 1.01, 0.0], [1.0, 1.1, 1.0]),
+            ([0.0, 1.11, 0.0], [0.1, 2.0, 0.1]),
+            ([0.9, 1.11, 0.0], [1.0, 2.0, 0.1]),
+            ([0.0, 1.6, 0.11], [1.0, 1.9 + shift, 0.2]),
+        ];
+        let mut text = String::new();
+        for (low, high) in boards {
+            for i in 0..8 {
+                let p: [f64; 3] =
+                    std::array::from_fn(|k| if i >> k & 1 == 1 { high[k] } else { low[k] });
+                text.push_str(&format!("v {} {} {}\n", p[0], p[1], p[2]));
+            }
+            for quad in [
+                "-8 -6 -5 -7",
+                "-4 -3 -1 -2",
+                "-8 -7 -3 -4",
+                "-6 -2 -1 -5",
+                "-8 -4 -2 -6",
+                "-7 -5 -1 -3",
+            ] {
+                text.push_str(&format!("f {quad}\n"));
+            }
+        }
+        text
+    };
+    for i in 0..6 {
+        let text = pieces(0.02 * f64::from(i));
+        add(
+            &library,
+            &format!("chair {i}"),
+            text.into_bytes(),
+            Format::Obj,
+        )
+        .unwrap();
+    }
+    for i in 0..6 {
+        let shape = library.shape("all", &format!("chair {i}")).unwrap();
+        assert_eq!(shape.report.n_components, 8);
+        assert!(shape.report.n_bridges >= 7);
+        let labels = library.labels("all", &shape.name, None).unwrap().labels;
+        assert_eq!(labels.len(), 8 * 6);
+        // The four legs are alike; a board has one label.
+        for piece in labels.chunks(6) {
+            let most = piece.iter().filter(|l| **l == piece[0]).count();
+            assert!(most >= 5, "{labels:?}");
+        }
+        assert!(
+            labels[..24].iter().filter(|l| **l == labels[0]).count() >= 20,
+            "{labels:?}"
+        );
+        assert_ne!(labels[0], labels[24], "leg and seat: {labels:?}");
+    }
+}
+
+/// Labels come back for each polygon, and a made shape's known parts survive as many formats as there are.
+#[test]
+fn a_made_shape_reads_the_same_in_every_format() {
+    let options = synth::Options {
+        n_faces: 1_000,
+        rotate: false,
+    };
+    let shape = &synth::family(synth::Family::Chair, 1, 1, &options)[0];
+    let labels: Vec<i32> = shape.labels.iter().map(|&l| l as i32).collect();
+    let (vertices, faces) = (&shape.mesh.vertices, &shape.mesh.faces);
+    let off = parse(write::off(&shape.mesh).as_bytes(), Format::Off).unwrap();
+    let text = write::obj(vertices, faces, &labels, |l| format!("label_{l}"), "m.mtl");
+    assert_eq!(parse(text.as_bytes(), Format::Obj).unwrap(), off);
+    assert_eq!(labels_of_obj(&text), labels);
+    let glb = write::glb("chair", vertices, faces, &labels, |l| {
+        (format!("label_{l}"), [0; 3])
+    });
+    let found = parse(&glb, Format::Gltf).unwrap();
+    assert_eq!(labels_of_glb(&glb, &found, &off), labels);
+}
