@@ -195,12 +195,12 @@ pub(crate) struct Serve {
     pub(crate) library: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) file: ConfigFile,
-    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
-    #[arg(long, value_name = "HOST:PORT")]
-    pub(crate) http: Option<String>,
     /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
     #[arg(long, value_name = "DIR")]
     pub(crate) keys: Option<PathBuf>,
+    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
+    #[arg(long, value_name = "HOST:PORT")]
+    pub(crate) http: Option<String>,
     /// Threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
@@ -418,6 +418,26 @@ pub(crate) struct Map {
     /// Write c_12 and p2p_21 to this safetensors file
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
+    /// Draw both shapes, with colours carried over, and the entries of c_12 to this PNG file
+    #[arg(long, value_name = "FILE")]
+    pub(crate) png: Option<PathBuf>,
+    /// A map between points, computed now, in place of the one that carries labels
+    #[arg(long)]
+    pub(crate) points: bool,
+    /// With --points: the map that takes left for right
+    #[arg(long, requires = "points")]
+    pub(crate) mirrored: bool,
+    /// With --points: proxy vertices of both shapes that correspond, as FROM:TO; may be given again
+    #[arg(long, requires = "points", value_name = "FROM:TO", value_parser = landmark)]
+    pub(crate) landmark: Vec<(u32, u32)>,
+}
+
+/// `FROM:TO`, two vertices.
+fn landmark(text: &str) -> Result<(u32, u32), String> {
+    let parsed = text
+        .split_once(':')
+        .and_then(|(from, to)| Some((from.parse().ok()?, to.parse().ok()?)));
+    parsed.ok_or_else(|| format!("{text:?} is not FROM:TO, two vertex numbers"))
 }
 
 /// `coseg nearest`

@@ -185,10 +185,10 @@ pub struct Overrides {
     pub endpoint: Option<String>,
     /// `--library`.
     pub library: Option<PathBuf>,
-    /// `--http`.
-    pub http: Option<String>,
     /// `--keys`.
     pub keys: Option<PathBuf>,
+    /// `--http`.
+    pub http: Option<String>,
     /// `--workers`.
     pub workers: Option<usize>,
     /// `--log-level`.
@@ -249,11 +249,11 @@ impl Config {
         if let Some(library) = &overrides.library {
             config.server.library.clone_from(library);
         }
-        if let Some(listen) = &overrides.http {
-            config.http.listen.clone_from(listen);
-        }
         if let Some(keys) = &overrides.keys {
             config.security.keys.clone_from(keys);
+        }
+        if let Some(listen) = &overrides.http {
+            config.http.listen.clone_from(listen);
         }
         if let Some(workers) = overrides.workers {
             config.work.workers = workers;

@@ -3,6 +3,7 @@
 mod add;
 pub(crate) mod bench;
 mod bench_labels;
+mod bench_maps;
 mod check;
 mod collections;
 mod completions;
@@ -191,11 +192,11 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
             .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
         Command::Bench(args) => bench::run(args, &cli.global),
-        Command::View(args) => view::run(args, session()?),
         Command::Jobs(args) => jobs::jobs(args, session()?),
         Command::Retry(args) => jobs::retry(args, session()?),
         Command::Keys(args) => keys::run(args, &cli.global),
         Command::Worker => return Ok(coseg::daemon::run_worker()),
+        Command::View(args) => view::run(args, session()?),
         Command::Stats => stats::run(session()?),
         Command::Top(args) => top::run(args, session()?),
         Command::Completions { shell } => completions::run(*shell),

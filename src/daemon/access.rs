@@ -178,6 +178,7 @@ fn needed(body: &Body) -> Role {
         | Body::GetPartCorrespondence(_)
         | Body::Nearest(_)
         | Body::GetPortraits(_)
+        | Body::TransferFunction(_)
         | Body::SuggestNext(_)
         | Body::EventsSince(_) => Role::ReadOnly,
         Body::CreateCollection(_)

@@ -70,13 +70,13 @@ pub enum StartError {
         endpoint: String,
         source: zmq::Error,
     },
+    #[error("a worker process cannot be started: {0}")]
+    Worker(std::io::Error),
     #[error("http.listen {address}: {source}")]
     Http {
         address: std::net::SocketAddr,
         source: std::io::Error,
     },
-    #[error("a worker process cannot be started: {0}")]
-    Worker(std::io::Error),
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -91,8 +91,8 @@ impl StartError {
             }
             Self::Library { .. }
             | Self::Socket { .. }
-            | Self::Http { .. }
             | Self::Worker(_)
+            | Self::Http { .. }
             | Self::Threads(_) => false,
         }
     }
@@ -385,8 +385,8 @@ impl Running {
                 "server.library",
                 new.server.library != config.server.library,
             ),
-            ("http", new.http != config.http),
             ("security.keys", new.security.keys != config.security.keys),
+            ("http", new.http != config.http),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
             (

@@ -4,12 +4,13 @@ use crate::daemon::metrics::Now;
 use crate::daemon::requests::{Answer, MAX_WAIT_MS};
 use crate::daemon::sockets::{MAX_FRAMES, MAX_HEADER_BYTES, MAX_ID_CHARS};
 use crate::daemon::{Daemon, requests};
-use crate::ipc::frames::FrameWriter;
+use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
 use crate::library::{JobFilter, LibraryError};
 use crate::mesh::Format;
 use crate::viewer::{Pack, PortraitError, portrait};
+use bytes::Bytes;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -29,8 +30,8 @@ const CAPABILITIES: [&str; 6] = [
     "events",
 ];
 
-/// Answers one request.
-pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
+/// Answers one request that came with these raw frames.
+pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer {
     let library = &daemon.library;
     let mut frames = FrameWriter::default();
     let result = match body {
@@ -94,6 +95,21 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body) -> Answer {
                 .description(&r.collection, &r.shape)
                 .map_err(refuse)?;
             Reply::GetDescriptors(convert::descriptors(&description.view(), &mut frames))
+        }
+        Body::GetFunctionalMap(r) if r.points.is_some() => {
+            let asked = convert::point_request(&r.points.unwrap_or_default());
+            let maps = library
+                .point_maps(&r.collection, &r.from, &r.to, &asked)
+                .map_err(refuse)?;
+            Reply::GetFunctionalMap(convert::point_maps(&maps, &mut frames))
+        }
+        Body::TransferFunction(r) => {
+            let values = convert::polygon_values(r.values.as_ref(), FrameReader::new(sent))?;
+            let asked = convert::point_request(&r.points.unwrap_or_default());
+            let (carried, map) = library
+                .transfer(&r.collection, &r.from, &r.to, &values, &asked)
+                .map_err(refuse)?;
+            Reply::TransferFunction(convert::transferred(&carried, &map, &mut frames))
         }
         Body::GetFunctionalMap(r) => {
             let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;

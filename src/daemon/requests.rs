@@ -105,14 +105,17 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetDescriptors(_)
             | Body::GetFunctionalMap(_)
             | Body::GetPartCorrespondence(_)
+            | Body::TransferFunction(_)
             | Body::Nearest(_)
             | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let turn = readers.queue(&client);
+                let mut in_hand = in_hand;
+                let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
                     let _pass = turn.come().await;
-                    blocking(&d, move |d| reads::answer(d, body))
+                    blocking(&d, move |d| reads::answer(d, body, &frames))
                         .await
                         .unwrap_or_else(panicked)
                 }));

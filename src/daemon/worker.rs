@@ -148,6 +148,8 @@ impl Process {
             .arg0("coseg")
             .arg(WORKER_COMMAND)
             .env("RAYON_NUM_THREADS", threads.to_string())
+            // A backtrace would push what was said before it out of the lines that are kept.
+            .env("RUST_BACKTRACE", "0")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())

@@ -139,6 +139,10 @@ pub fn quality(q: &wire::MapQuality) -> Value {
         "orthogonality": q.orthogonality,
         "coverage": q.coverage,
         "near_zero": q.near_zero,
+        "round_trip": q.round_trip,
+        "smoothness": q.smoothness,
+        "orientation": q.orientation,
+        "expected_error": q.expected_error,
     })
 }
 

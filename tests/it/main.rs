@@ -9,6 +9,7 @@ mod formats;
 mod golden;
 mod harness;
 mod hostile;
+mod maps;
 mod pipeline;
 mod snapshot;
 mod spectra;

@@ -133,7 +133,7 @@ async fn library(server: &Server) -> Answer {
     Ok(Found::Json(json!({
         "version": env!("CARGO_PKG_VERSION"),
         "instance": server.daemon.instance,
-        "edit": server.daemon.config().http.edit,
+        "edit": server.daemon.config().http.edit && !server.daemon.has_keys,
         "n_queued": queued,
         "stages": at_work,
         "collections": collections,

@@ -47,6 +47,8 @@ const SOCKETS_HANG: Duration = Duration::from_secs(10);
 const CLIENT: &[u8] = b"http";
 /// Header without which nothing is changed.
 const GUARD: &str = "x-coseg";
+/// Who all HTTP requests count for: no client of the sockets, whose identities have five bytes if they begin with a zero.
+const CLIENT: Bytes = Bytes::from_static(b"\0http requests");
 
 /// An answer, its body in memory.
 type Page = Response<Full<Bytes>>;
@@ -221,6 +223,12 @@ impl Server {
         if !self.daemon.config().http.edit {
             return Err("http.edit is false: this viewer only shows".to_owned());
         }
+        if self.daemon.has_keys {
+            return Err(
+                "security.keys is set, and HTTP cannot tell who asks: this viewer only shows"
+                    .to_owned(),
+            );
+        }
         let value = |name: &str| headers.get(name).and_then(|v| v.to_str().ok());
         if value(GUARD) != Some("1") {
             return Err(format!("a change needs the header {GUARD}: 1"));
@@ -286,11 +294,8 @@ impl Server {
         let Some(memory) = self.daemon.request_memory.try_reserve(n_bytes) else {
             return Err(busy("requests in hand leave no memory for this one"));
         };
-        let admitted = self
-            .daemon
-            .quotas
-            .admit(&Bytes::from_static(CLIENT), n_bytes);
-        let ticket = admitted.map_err(|text| busy(&text))?;
+        let ticket = self.daemon.quotas.admit(&CLIENT, n_bytes);
+        let ticket = ticket.map_err(|text| busy(&text))?;
         let (sender, receiver) = oneshot::channel();
         let incoming = Incoming {
             reply_to: ReplyTo::Task(sender),

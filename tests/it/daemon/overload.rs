@@ -104,7 +104,7 @@ fn what_the_queue_can_never_hold_is_refused_for_good() {
     ];
     let daemon = home.start_with(&[], &env);
     let client = &mut daemon.client();
-    create(client, "c");
+    super::create_with(client, "c", 2);
     let mesh = skittle(0);
     let names = ["a", "b", "c", "d"];
     let shapes: Vec<_> = names.iter().map(|n| (*n, mesh.as_str())).collect();
