@@ -43,8 +43,6 @@ const MAX_BODY: usize = 8 << 20;
 const ANSWER_MS: u64 = 60_000;
 /// The socket thread looks around twice a second; after this long without it hangs.
 const SOCKETS_HANG: Duration = Duration::from_secs(10);
-/// All browsers together are one client: they take turns with the others, and share its quota.
-const CLIENT: &[u8] = b"http";
 /// Header without which nothing is changed.
 const GUARD: &str = "x-coseg";
 /// Who all HTTP requests count for: no client of the sockets, whose identities have five bytes if they begin with a zero.
