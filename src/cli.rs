@@ -2,9 +2,11 @@
 
 mod care;
 mod corrections;
+mod looking;
 
 pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+pub(crate) use looking::{Top, View};
 
 use crate::commands::bench::Bench;
 use crate::commands::demo::DemoArgs;
@@ -83,7 +85,7 @@ pub(crate) struct Global {
     pub(crate) json: bool,
 }
 
-fn seconds(text: &str) -> Result<Duration, String> {
+pub(crate) fn seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text
         .parse()
         .map_err(|_| format!("{text:?} is not a number of seconds"))?;
@@ -112,6 +114,8 @@ pub(crate) enum Command {
     Export(Export),
     /// Draw a collection in the colours of its labels, as one PNG
     Render(Render),
+    /// Write the viewer with a collection as one HTML file, which needs nothing else
+    View(View),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
     /// List the shapes most like one shape
@@ -139,6 +143,8 @@ pub(crate) enum Command {
     Collections(Collections),
     /// Show counters of the daemon
     Stats,
+    /// Follow queue, rates and stages of the daemon, as they change
+    Top(Top),
     /// Let the daemon finish what it is at and stop
     Stop,
     /// Compute the spectrum and descriptors of one mesh, without a daemon
@@ -168,6 +174,17 @@ pub(crate) enum Command {
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
+    /// Print the completions of a shell
+    Completions {
+        /// For which shell
+        shell: clap_complete::Shell,
+    },
+    /// Print the manual page, or write one for each command
+    Man {
+        /// Folder to write all pages to, created if missing
+        #[arg(long, value_name = "DIR")]
+        out: Option<PathBuf>,
+    },
 }
 
 /// `coseg serve`
@@ -181,6 +198,9 @@ pub(crate) struct Serve {
     /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
     #[arg(long, value_name = "DIR")]
     pub(crate) keys: Option<PathBuf>,
+    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
+    #[arg(long, value_name = "HOST:PORT")]
+    pub(crate) http: Option<String>,
     /// Threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
@@ -398,6 +418,26 @@ pub(crate) struct Map {
     /// Write c_12 and p2p_21 to this safetensors file
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
+    /// Draw both shapes, with colours carried over, and the entries of c_12 to this PNG file
+    #[arg(long, value_name = "FILE")]
+    pub(crate) png: Option<PathBuf>,
+    /// A map between points, computed now, in place of the one that carries labels
+    #[arg(long)]
+    pub(crate) points: bool,
+    /// With --points: the map that takes left for right
+    #[arg(long, requires = "points")]
+    pub(crate) mirrored: bool,
+    /// With --points: proxy vertices of both shapes that correspond, as FROM:TO; may be given again
+    #[arg(long, requires = "points", value_name = "FROM:TO", value_parser = landmark)]
+    pub(crate) landmark: Vec<(u32, u32)>,
+}
+
+/// `FROM:TO`, two vertices.
+fn landmark(text: &str) -> Result<(u32, u32), String> {
+    let parsed = text
+        .split_once(':')
+        .and_then(|(from, to)| Some((from.parse().ok()?, to.parse().ok()?)));
+    parsed.ok_or_else(|| format!("{text:?} is not FROM:TO, two vertex numbers"))
 }
 
 /// `coseg nearest`

@@ -9,6 +9,7 @@ pub use size::ByteSize;
 use config::{FileFormat, Source, Value, ValueKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 /// The default settings, commented.
@@ -47,6 +48,8 @@ pub enum ConfigError {
 pub struct Config {
     /// Where the daemon listens and keeps things.
     pub server: Server,
+    /// What browsers and monitoring reach.
+    pub http: Http,
     /// How work is done.
     pub work: Work,
     /// What is refused beyond.
@@ -66,6 +69,44 @@ pub struct Server {
     pub endpoint: String,
     /// The folder of the library; empty: the default.
     pub library: PathBuf,
+}
+
+/// What browsers and monitoring reach.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Http {
+    /// HOST:PORT to listen at; empty: nowhere.
+    pub listen: String,
+    /// Whether that may be an address that other machines reach.
+    pub allow_remote: bool,
+    /// Whether the viewer may change labels.
+    pub edit: bool,
+}
+
+impl Http {
+    /// The address to listen at, if there is one; `localhost` is 127.0.0.1.
+    pub fn address(&self) -> Result<Option<SocketAddr>, ConfigError> {
+        if self.listen.is_empty() {
+            return Ok(None);
+        }
+        let refuse = |message: String| ConfigError::Value {
+            key: "http.listen".to_owned(),
+            message,
+        };
+        let numeric = match self.listen.strip_prefix("localhost:") {
+            Some(port) => format!("127.0.0.1:{port}"),
+            None => self.listen.clone(),
+        };
+        let address: SocketAddr = numeric
+            .parse()
+            .map_err(|_| refuse(format!("{:?} is not IP-ADDRESS:PORT", self.listen)))?;
+        if !address.ip().is_loopback() && !self.allow_remote {
+            return Err(refuse(format!(
+                "{address} is not loopback; the endpoint has no authentication, so set http.allow_remote if \
+                 other machines are to reach it"
+            )));
+        }
+        Ok(Some(address))
+    }
 }
 
 /// How work is done.
@@ -146,6 +187,8 @@ pub struct Overrides {
     pub library: Option<PathBuf>,
     /// `--keys`.
     pub keys: Option<PathBuf>,
+    /// `--http`.
+    pub http: Option<String>,
     /// `--workers`.
     pub workers: Option<usize>,
     /// `--log-level`.
@@ -208,6 +251,9 @@ impl Config {
         }
         if let Some(keys) = &overrides.keys {
             config.security.keys.clone_from(keys);
+        }
+        if let Some(listen) = &overrides.http {
+            config.http.listen.clone_from(listen);
         }
         if let Some(workers) = overrides.workers {
             config.work.workers = workers;
@@ -295,6 +341,7 @@ impl Config {
                 format!("{:?} is not absolute", path.display()),
             );
         }
+        self.http.address()?;
         if !self.server.endpoint.is_empty() {
             crate::ipc::endpoint::Endpoint::parse(&self.server.endpoint)
                 .and_then(|e| e.check_servable(self.has_keys()))
@@ -463,6 +510,8 @@ mod tests {
         assert_eq!(config.limits.memory, ByteSize(1 << 30));
         assert_eq!(config.n_workers(), 3);
         assert_eq!(config.log, default.log);
+        let open = load("[http]\nlisten = \"[::]:80\"\nallow_remote = true\n").unwrap();
+        assert!(open.http.address().unwrap().is_some());
     }
 
     #[test]
@@ -499,6 +548,14 @@ mod tests {
             (
                 "[server]\nendpoint = \"udp://127.0.0.1:1\"",
                 "neither ipc://PATH nor tcp://HOST:PORT",
+            ),
+            (
+                "[http]\nlisten = \"0.0.0.0:80\"",
+                "http.listen: 0.0.0.0:80 is not loopback",
+            ),
+            (
+                "[http]\nlisten = \"80\"",
+                "http.listen: \"80\" is not IP-ADDRESS:PORT",
             ),
             ("[log]\nlevel = \"coseg=loud\"", "log.level"),
             ("[log]\nformat = \"xml\"", "format"),

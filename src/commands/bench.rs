@@ -1,6 +1,7 @@
 //! `coseg bench`: how good the product is on meshes whose parts are known.
 
 use super::bench_labels::{Category, Run};
+use super::bench_maps::{self, BenchMaps};
 use super::demo::{DRAIN_LIMIT, Scratch, log_warnings, start};
 use super::session::{Session, print_line, table};
 use super::{CommandError, Outcome, bench_labels};
@@ -16,6 +17,8 @@ use std::path::PathBuf;
 pub(crate) enum Bench {
     /// Label meshes with known parts, streamed one by one, and compare
     Labels(BenchLabels),
+    /// Map meshes with known correspondence to each other, and compare
+    Maps(BenchMaps),
 }
 
 /// `coseg bench labels`
@@ -81,7 +84,10 @@ impl Row {
 }
 
 pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
-    let Bench::Labels(args) = bench;
+    let args = match bench {
+        Bench::Labels(args) => args,
+        Bench::Maps(args) => return bench_maps::run(args, global),
+    };
     let categories = bench_labels::categories(&args.data, &args.category, args.limit)?;
     let up = args.up.unwrap_or(wire::Up::Unknown);
     log_warnings()?;

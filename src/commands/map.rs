@@ -1,5 +1,6 @@
 //! `coseg map`: the functional map from one shape to another, and which parts it matches.
 
+use super::render::pair;
 use super::session::{Session, table};
 use super::{CommandError, Outcome, json};
 use crate::cli::Map;
@@ -16,14 +17,9 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         collection: collection.clone(),
         from: args.from.clone(),
         to: args.to.clone(),
+        points: args.points.then(|| points(args)),
     };
     let (map, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
-    let request = wire::GetPartCorrespondenceRequest {
-        collection,
-        shape_a: args.from.clone(),
-        shape_b: args.to.clone(),
-    };
-    let parts = call!(session.client, GetPartCorrespondence(request))?;
     if let Some(path) = &args.out {
         write_arrays(
             path,
@@ -31,6 +27,34 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
             &frames,
         )?;
     }
+    if let Some(path) = &args.png {
+        let sheet = pair::Sheet {
+            from: pair::Side::receive(&mut session, &collection, &args.from)?,
+            to: pair::Side::receive(&mut session, &collection, &args.to)?,
+            c_12: array(&map.c_12, &frames, f32::from_le_bytes),
+            columns: map
+                .c_12
+                .as_ref()
+                .and_then(|c| c.shape.get(1))
+                .map_or(0, |k| *k as usize),
+            p2p_21: array(&map.p2p_21, &frames, u32::from_le_bytes),
+        };
+        let file = |source| CommandError::File {
+            path: path.display().to_string(),
+            source,
+        };
+        std::fs::write(path, sheet.png().map_err(file)?).map_err(file)?;
+    }
+    let parts = if args.points {
+        wire::GetPartCorrespondenceReply::default()
+    } else {
+        let request = wire::GetPartCorrespondenceRequest {
+            collection,
+            shape_a: args.from.clone(),
+            shape_b: args.to.clone(),
+        };
+        call!(session.client, GetPartCorrespondence(request))?
+    };
     let shape = map
         .c_12
         .as_ref()
@@ -44,6 +68,8 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
             "to": args.to,
             "c_12_shape": shape,
             "quality": json::quality(&quality),
+            "alternative_quality": map.alternative_quality.as_ref().map(json::quality),
+            "alternative_cost": map.alternative_cost,
             "matches": matches,
         }))?;
         return Ok(true);
@@ -59,6 +85,10 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         quality.coverage,
         quality.near_zero
     ))?;
+    if args.points {
+        session.line(&point_line(&quality, map.alternative_cost))?;
+        return Ok(true);
+    }
     let (from, to) = (
         format!("part of {}", args.from),
         format!("part of {}", args.to),
@@ -81,6 +111,56 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
     }));
     session.line(&table(&rows))?;
     Ok(true)
+}
+
+/// What is asked of a map between points.
+fn points(args: &Map) -> wire::PointMapOptions {
+    let orientation = if args.mirrored {
+        wire::MapOrientation::Reverse
+    } else {
+        wire::MapOrientation::Unspecified
+    };
+    wire::PointMapOptions {
+        landmarks: args
+            .landmark
+            .iter()
+            .map(|&(from, to)| wire::Landmark { from, to })
+            .collect(),
+        orientation: orientation.into(),
+        k: 0,
+        alternative: true,
+    }
+}
+
+/// What is known of a map between points besides, and of its alternative.
+fn point_line(q: &wire::MapQuality, alternative: Option<f64>) -> String {
+    let orientation = q.orientation();
+    let turned = if orientation < 0.0 {
+        "reverses"
+    } else {
+        "keeps"
+    };
+    let other = match alternative {
+        Some(cost) => format!("the other orientation costs {cost:.2} times as much"),
+        None => "no map of the other orientation was found".to_owned(),
+    };
+    format!(
+        "{turned} orientation ({orientation:.2}), round trip {:.3}, smoothness {:.2}, error to expect {:.3} of the root of the area; {other}",
+        q.round_trip(),
+        q.smoothness(),
+        q.expected_error(),
+    )
+}
+
+/// The elements of a received array; none if it is missing.
+fn array<T>(
+    array: &Option<ArrayRef>,
+    frames: &[bytes::Bytes],
+    read: impl Fn([u8; 4]) -> T,
+) -> Vec<T> {
+    let frame = array.as_ref().and_then(|a| frames.get(a.frame as usize));
+    let words = frame.map(|f| f.as_chunks::<4>().0).unwrap_or_default();
+    words.iter().map(|w| read(*w)).collect()
 }
 
 /// Writes arrays as they came: frames and safetensors are both little-endian and row-major.

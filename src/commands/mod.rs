@@ -3,8 +3,10 @@
 mod add;
 pub(crate) mod bench;
 mod bench_labels;
+mod bench_maps;
 mod check;
 mod collections;
+mod completions;
 mod config;
 mod correct;
 pub(crate) mod demo;
@@ -14,10 +16,10 @@ mod events;
 mod export;
 mod export_mesh;
 mod jobs;
-mod json;
 mod keys;
 mod labels;
 mod ls;
+mod man;
 mod map;
 mod merge;
 mod name;
@@ -31,7 +33,9 @@ mod stats;
 mod stop;
 mod suggest;
 pub(crate) mod synth;
+mod top;
 mod undo;
+mod view;
 mod wait;
 mod watch;
 
@@ -40,7 +44,9 @@ use coseg::config::ConfigError;
 use coseg::daemon::ServeError;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::endpoint::EndpointError;
+use coseg::ipc::json;
 use coseg::ipc::keys::KeyError;
+use coseg::ipc::wire::ErrorReason;
 use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
@@ -111,6 +117,32 @@ impl CommandError {
         ExitCode::from(code)
     }
 
+    /// What to do next, where that is not plain from the message.
+    pub(crate) fn advice(&self) -> Option<&'static str> {
+        let refusal = match self {
+            Self::Client(ClientError::NoAnswer { .. }) => {
+                return Some("start one with `coseg serve`, or say where it is with --endpoint");
+            }
+            Self::Client(ClientError::Refused(e)) => e,
+            _ => return None,
+        };
+        Some(match refusal.reason() {
+            ErrorReason::NoCollection => "`coseg ls` lists the collections",
+            ErrorReason::NoShape => "`coseg ls --collection NAME` lists the shapes",
+            ErrorReason::NoLabel | ErrorReason::LabelMerged => {
+                "`coseg show --collection NAME` lists the labels"
+            }
+            ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
+            ErrorReason::Draining => "start the daemon again; it takes up what it had accepted",
+            ErrorReason::ReadOnly | ErrorReason::Damaged => {
+                "look at the daemon's log, then run `coseg check`"
+            }
+            ErrorReason::NoSpace => "make room on the disk of the library; nothing was lost",
+            ErrorReason::MeshTooLarge => "`coseg config show` has limits.max_shape",
+            _ => return None,
+        })
+    }
+
     /// Whether there is nothing to say about it.
     pub(crate) fn is_silent(&self) -> bool {
         matches!(self, Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe)
@@ -164,7 +196,11 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Retry(args) => jobs::retry(args, session()?),
         Command::Keys(args) => keys::run(args, &cli.global),
         Command::Worker => return Ok(coseg::daemon::run_worker()),
+        Command::View(args) => view::run(args, session()?),
         Command::Stats => stats::run(session()?),
+        Command::Top(args) => top::run(args, session()?),
+        Command::Completions { shell } => completions::run(*shell),
+        Command::Man { out } => man::run(out.as_deref()),
         Command::Stop => stop::run(session()?),
     }?;
     Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))

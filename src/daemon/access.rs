@@ -177,6 +177,8 @@ fn needed(body: &Body) -> Role {
         | Body::GetFunctionalMap(_)
         | Body::GetPartCorrespondence(_)
         | Body::Nearest(_)
+        | Body::GetPortraits(_)
+        | Body::TransferFunction(_)
         | Body::SuggestNext(_)
         | Body::EventsSince(_) => Role::ReadOnly,
         Body::CreateCollection(_)

@@ -7,7 +7,9 @@
 
 mod access;
 mod fair;
+mod http;
 mod memory;
+mod metrics;
 mod progress;
 mod publish;
 mod quota;
@@ -29,6 +31,7 @@ use crate::ipc::keys::KeyError;
 use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
+use metrics::Metrics;
 use progress::Waiting;
 use publish::Notice;
 use quota::Quotas;
@@ -69,6 +72,11 @@ pub enum StartError {
     },
     #[error("a worker process cannot be started: {0}")]
     Worker(std::io::Error),
+    #[error("http.listen {address}: {source}")]
+    Http {
+        address: std::net::SocketAddr,
+        source: std::io::Error,
+    },
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -81,9 +89,11 @@ impl StartError {
             Self::Endpoint(e) => {
                 !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
             }
-            Self::Library { .. } | Self::Socket { .. } | Self::Worker(_) | Self::Threads(_) => {
-                false
-            }
+            Self::Library { .. }
+            | Self::Socket { .. }
+            | Self::Worker(_)
+            | Self::Http { .. }
+            | Self::Threads(_) => false,
         }
     }
 }
@@ -106,6 +116,9 @@ struct Daemon {
     instance: String,
     started: Instant,
     counters: Arc<Counters>,
+    metrics: Arc<Metrics>,
+    /// Where the viewer is served, if it is.
+    http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
     quotas: Arc<Quotas>,
     /// Whether connections are authenticated.
@@ -185,6 +198,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     }
     let access = access::Access::new(&config.security.keys)?;
     let bound = sockets::bind(&endpoint, &config.limits, access)?;
+    let address = config.http.address()?;
+    let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
     let opened = |source| StartError::Library {
         path: directory.display().to_string(),
@@ -209,6 +224,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         instance: instance(),
         started: Instant::now(),
         counters: Arc::default(),
+        metrics: Arc::new(Metrics::new()),
+        http: listener.as_ref().and_then(|l| l.local_addr().ok()),
         request_memory: Budget::new(config.limits.request_bytes()),
         quotas: Quotas::new(&config.limits),
         has_keys: config.has_keys(),
@@ -228,6 +245,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("coseg")
+        .enable_io()
         .enable_time()
         .build()?;
     let socket_tick = Arc::new(AtomicU64::new(0));
@@ -250,11 +268,18 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
     tokio::spawn(sweep(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
+    if let Some(listener) = listener {
+        let listener = tokio::net::TcpListener::from_std(listener)?;
+        let server = http::Server::new(Arc::clone(&daemon), requests_in.clone());
+        tokio::spawn(server.watch(Arc::clone(&socket_tick)));
+        tokio::spawn(http::serve(server, listener));
+    }
     drop(guard);
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
         quotas: Arc::clone(&daemon.quotas),
         counters: Arc::clone(&daemon.counters),
+        metrics: Arc::clone(&daemon.metrics),
         tick: Arc::clone(&socket_tick),
         max_message_bytes: daemon.config().limits.max_message.0,
     };
@@ -295,7 +320,10 @@ async fn sweep(daemon: Arc<Daemon>) {
         match swept {
             Ok(Ok(files)) if files.is_empty() => {}
             Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
-            Ok(Err(e)) => tracing::warn!(error = %e, "orphaned files cannot be removed"),
+            Ok(Err(e)) => {
+                daemon.metrics.fault("sweep");
+                tracing::warn!(error = %e, "orphaned files cannot be removed");
+            }
             Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
         }
     }
@@ -319,6 +347,11 @@ impl Running {
     /// Where events are published.
     pub fn events(&self) -> &Endpoint {
         &self.daemon.events
+    }
+
+    /// Where the viewer is served, if it is.
+    pub fn http(&self) -> Option<std::net::SocketAddr> {
+        self.daemon.http
     }
 
     /// Takes over the settings that can change while the daemon runs; the names of the others that differ
@@ -353,6 +386,7 @@ impl Running {
                 new.server.library != config.server.library,
             ),
             ("security.keys", new.security.keys != config.security.keys),
+            ("http", new.http != config.http),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
             (

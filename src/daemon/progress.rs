@@ -3,7 +3,7 @@
 //! The catalog knows what is durable; the stage a shape is at is not, and lives here.
 
 use crate::library::JobItem;
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use tokio::sync::mpsc;
 
 /// A shape that waits to be described.
@@ -244,6 +244,21 @@ impl<S> Progress<S> {
         }
     }
 
+    /// Jobs of which a shape is in work, and jobs that only wait.
+    pub(crate) fn n_jobs(&self) -> (usize, usize) {
+        let working = self.jobs.values().filter(|j| !j.stages.is_empty()).count();
+        (working, self.jobs.len() - working)
+    }
+
+    /// Shapes in work at each stage.
+    pub(crate) fn n_at_stages(&self) -> BTreeMap<String, usize> {
+        let mut counts = BTreeMap::new();
+        for stage in self.jobs.values().flat_map(|j| j.stages.values()) {
+            *counts.entry(stage.clone()).or_default() += 1;
+        }
+        counts
+    }
+
     fn touch(&mut self, job: u64) {
         self.n_changes += 1;
         if let Some(live) = self.jobs.get_mut(&job) {
@@ -301,6 +316,8 @@ mod tests {
         let (first, _) = progress.pop().unwrap();
         progress.set_stage(&first.item, "spectrum");
         assert_eq!(progress.stage(7, 0), Some("spectrum"));
+        assert_eq!(progress.n_jobs(), (1, 0));
+        assert_eq!(progress.n_at_stages().get("spectrum"), Some(&1));
         assert!(progress.revision(7).unwrap() > before);
         progress.finish(&first.item);
         assert_eq!((progress.n_live(Some("a")), progress.n_live(None)), (1, 1));

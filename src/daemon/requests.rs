@@ -3,7 +3,7 @@
 
 use crate::daemon::fair::{Gate, Turn};
 use crate::daemon::service::Control;
-use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
+use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
 use crate::daemon::{Daemon, blocking, reads, writes};
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
@@ -44,7 +44,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
         let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
             let error = busy("too many requests are in hand");
             daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let Some(body) = incoming.request.body.take() else {
@@ -53,7 +53,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
                 ErrorReason::UnknownRequest,
                 "the request has no body that this version knows",
             );
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let in_hand = InHand { incoming, permit };
@@ -105,13 +105,17 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetDescriptors(_)
             | Body::GetFunctionalMap(_)
             | Body::GetPartCorrespondence(_)
+            | Body::TransferFunction(_)
             | Body::Nearest(_)
+            | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let turn = readers.queue(&client);
+                let mut in_hand = in_hand;
+                let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
                     let _pass = turn.come().await;
-                    blocking(&d, move |d| reads::answer(d, body))
+                    blocking(&d, move |d| reads::answer(d, body, &frames))
                         .await
                         .unwrap_or_else(panicked)
                 }));
@@ -179,7 +183,11 @@ impl InHand {
     /// Sends the reply and gives back the permit.
     fn finish(self, daemon: &Daemon, answer: Answer) {
         drop(self.incoming.ticket);
-        daemon.answer(self.incoming.peer, self.incoming.request.request_id, answer);
+        daemon.answer(
+            self.incoming.reply_to,
+            self.incoming.request.request_id,
+            answer,
+        );
         drop(self.permit);
     }
 
@@ -230,16 +238,23 @@ impl InHand {
 }
 
 impl Daemon {
-    fn answer(&self, peer: Peer, request_id: String, answer: Answer) {
-        let (result, frames) = match answer {
-            Ok((result, frames)) => (result, frames),
-            Err(error) => {
-                if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
-                    tracing::error!(request_id, message = error.message, "a request failed");
-                }
-                (reply::Result::Error(error), Vec::new())
+    fn answer(&self, reply_to: ReplyTo, request_id: String, answer: Answer) {
+        if let Err(error) = &answer {
+            self.metrics.refused(error);
+            if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
+                tracing::error!(request_id, message = error.message, "a request failed");
+            }
+        }
+        let peer = match reply_to {
+            ReplyTo::Peer(peer) => peer,
+            ReplyTo::Task(task) => {
+                // Whoever asked may have stopped waiting.
+                let _ = task.send(answer);
+                return;
             }
         };
+        let (result, frames) =
+            answer.unwrap_or_else(|error| (reply::Result::Error(error), Vec::new()));
         self.outbox.reply(
             peer,
             Reply {
@@ -275,7 +290,7 @@ impl Daemon {
     }
 }
 
-fn busy(message: &str) -> wire::Error {
+pub(crate) fn busy(message: &str) -> wire::Error {
     let mut error = convert::error(
         ErrorCode::ResourceExhausted,
         ErrorReason::QueueFull,

@@ -85,6 +85,9 @@ pub fn serve(
         endpoint = %running.endpoint(), events = %running.events(),
         version = env!("CARGO_PKG_VERSION"), "serving"
     );
+    if let Some(address) = running.http() {
+        tracing::info!("viewer and metrics at http://{address}/");
+    }
     notify(&[NotifyState::Ready, NotifyState::Status("serving")]);
     attend(&running, reload);
     tracing::info!("draining");

@@ -4,7 +4,9 @@
 use crate::config::Limits;
 use crate::daemon::access::{Access, ZAP_ENDPOINT};
 use crate::daemon::memory::{Budget, Reservation};
+use crate::daemon::metrics::Metrics;
 use crate::daemon::quota::{Quotas, Ticket};
+use crate::daemon::requests::Answer;
 use crate::daemon::{Counters, StartError};
 use crate::ipc::convert;
 use crate::ipc::endpoint::{Endpoint, claim_socket};
@@ -60,9 +62,17 @@ pub(crate) struct Peer {
     delimiter: bool,
 }
 
+/// Who is waiting for a reply.
+pub(crate) enum ReplyTo {
+    /// A client of the sockets.
+    Peer(Peer),
+    /// A task of this process.
+    Task(tokio::sync::oneshot::Sender<Answer>),
+}
+
 /// A request that arrived.
 pub(crate) struct Incoming {
-    pub(crate) peer: Peer,
+    pub(crate) reply_to: ReplyTo,
     pub(crate) request: Request,
     pub(crate) frames: Vec<Bytes>,
     pub(crate) received: Instant,
@@ -255,6 +265,7 @@ pub(crate) struct Shared {
     pub(crate) memory: Arc<Budget>,
     pub(crate) quotas: Arc<Quotas>,
     pub(crate) counters: Arc<Counters>,
+    pub(crate) metrics: Arc<Metrics>,
     /// Advances while the thread lives.
     pub(crate) tick: Arc<AtomicU64>,
     pub(crate) max_message_bytes: u64,
@@ -404,6 +415,7 @@ impl SocketThread {
     fn request(&self, user: Option<String>, message: Vec<Bytes>) {
         let received = Instant::now();
         let n_bytes = message.iter().map(|f| f.len() as u64).sum();
+        self.shared.metrics.received_bytes.inc_by(n_bytes);
         let Some((peer, header, frames)) = split(message) else {
             return;
         };
@@ -470,7 +482,7 @@ impl SocketThread {
             return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
         };
         let incoming = Incoming {
-            peer,
+            reply_to: ReplyTo::Peer(peer.clone()),
             request,
             frames,
             received,
@@ -481,7 +493,7 @@ impl SocketThread {
             let incoming = refused.into_inner();
             let text = "too many requests wait".to_owned();
             let id = incoming.request.request_id;
-            self.busy(&incoming.peer, id, ErrorReason::QueueFull, text);
+            self.busy(&peer, id, ErrorReason::QueueFull, text);
         }
     }
 
@@ -493,6 +505,7 @@ impl SocketThread {
     }
 
     fn refuse(&self, peer: &Peer, request_id: String, error: wire::Error) {
+        self.shared.metrics.refused(&error);
         let reply = Reply {
             request_id,
             result: Some(reply::Result::Error(error)),
@@ -511,6 +524,11 @@ impl SocketThread {
         }
         parts.push(zmq::Message::from(reply.encode_to_vec()));
         parts.extend(frames.iter().map(|f| zmq::Message::from(&f[..])));
+        let metrics = &self.shared.metrics;
+        metrics.replies.inc();
+        metrics
+            .sent_bytes
+            .inc_by(parts.iter().map(|p| p.len() as u64).sum());
         match frames::send(&self.bound.router, parts, zmq::DONTWAIT) {
             Ok(()) => {}
             Err(zmq::Error::EHOSTUNREACH) => {

@@ -455,6 +455,7 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
             Ok(Err(LibraryError::Store(
                 e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
             ))) => {
+                daemon.metrics.fault("place");
                 tracing::error!(
                     collection = item.collection, shape = item.name, error = %e,
                     "a shape cannot be stored; trying again in {} s", delay.as_secs()
@@ -491,11 +492,15 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
 fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
     let (collection, shape) = (&item.collection, &item.name);
     match state {
-        ItemState::Done(placed) => tracing::info!(
-            collection, shape, outcome = ?placed.outcome, version = placed.version,
-            ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
-        ),
+        ItemState::Done(placed) => {
+            daemon.metrics.placed(placed);
+            tracing::info!(
+                collection, shape, outcome = ?placed.outcome, version = placed.version,
+                ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
+            );
+        }
         ItemState::Failed(f) => {
+            daemon.metrics.finished("failed");
             daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(
                 collection,
@@ -506,7 +511,10 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
                 "failed"
             );
         }
-        ItemState::Cancelled => tracing::info!(collection, shape, "cancelled"),
+        ItemState::Cancelled => {
+            daemon.metrics.finished("cancelled");
+            tracing::info!(collection, shape, "cancelled");
+        }
         ItemState::Queued | ItemState::Running(_) => {
             tracing::error!(collection, shape, "was placed but is not over");
         }
@@ -524,6 +532,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
         Ok(Ok(again)) => again,
         Ok(Err(LibraryError::NotFound { .. })) => false,
         Ok(Err(e)) => {
+            daemon.metrics.fault("relabel");
             tracing::error!(collection, error = %e, "a stale shape cannot be relabelled");
             false
         }
@@ -533,6 +542,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
         }
     };
     if again {
+        daemon.metrics.relabelled.inc();
         daemon.notice(Notice::Changed(collection.to_owned()));
     }
     daemon.work.changed();

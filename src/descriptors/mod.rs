@@ -18,7 +18,7 @@ pub use local_pca::local_pca;
 pub use position::{position, up_columns};
 pub use shape_diameter::shape_diameter;
 pub use signature::{N_SHAPE_DNA, signature};
-pub use spectral::{gps, hks, hks_times, null_space, shape_dna, wks};
+pub use spectral::{gps, hks, hks_times, null_space, shape_dna, wave_weights, wks};
 
 use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh};
 use nalgebra::DMatrix;

@@ -121,7 +121,7 @@ pub(super) fn kernels(
 }
 
 /// Weight of each eigenpair at each energy `(k, n_energies)`; columns sum to 1.
-fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
+pub fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
     let k = eigenvalues.len();
     let skip = null_space(eigenvalues);
     let mut weights = DMatrix::zeros(k, n_energies);

@@ -4,9 +4,30 @@
 //! carries coefficients on shape 1 to coefficients on shape 2; `p2p_21 (n2,)` gives for each vertex of 2 a
 //! vertex of 1, so that a function f on 1 is carried as `f[p2p_21]`.
 
+pub mod basis;
+pub mod bijective;
+pub mod convert;
+pub mod estimate;
+pub mod icp;
+pub mod landmarks;
+pub mod operators;
+pub mod orientation;
+pub mod points;
+pub mod precise;
+pub mod probes;
+mod quality;
+pub mod samples;
+pub mod solve;
+#[cfg(test)]
+mod test_shapes;
+pub mod transfer;
 mod zoomout;
 
-pub use zoomout::{MapOptions, MapShape, descriptor_zoomout};
+pub use basis::Basis;
+pub use estimate::{EstimateOptions, Side};
+pub use points::{PointMap, PointShape, point_maps};
+pub use quality::{Assessment, Quality};
+pub use zoomout::{MapOptions, MapShape, descriptor_zoomout, zoomout, zoomout_sampled};
 
 /// A functional map with its pointwise map and its quality.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,17 +42,4 @@ pub struct FunctionalMap {
     pub p2p_21: Vec<u32>,
     /// How good it is.
     pub quality: Quality,
-}
-
-/// How good a map is.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Quality {
-    /// Mass-weighted mean squared descriptor difference between matched vertices; 0 is perfect.
-    pub descriptor_residual: f64,
-    /// `‖CᵀC − I‖_F / √k`; 0 for an isometry.
-    pub orthogonality: f64,
-    /// Share of the mass of shape 1 that is hit, 0 to 1.
-    pub coverage: f64,
-    /// Share of entries of C with magnitude below 0.1 (Yang and Tian report at least 0.9).
-    pub near_zero: f64,
 }

@@ -6,10 +6,12 @@
 //! shapes that are not isometric the spectral embedding alone drifts; with the descriptors concatenated to it
 //! parts stay on parts. The start is the nearest neighbour in descriptor space.
 
-use super::{FunctionalMap, Quality};
+use super::FunctionalMap;
+use super::basis::{Basis, product};
+use super::convert::{functional, pointwise};
+use super::quality::Quality;
+use super::samples::{SampledBasis, columns};
 use crate::linalg::nearest::nearest_rows;
-use faer::linalg::matmul::matmul;
-use faer::{Accum, Mat, MatRef, Par};
 
 /// What a map needs of a shape.
 #[derive(Debug, Clone, Copy)]
@@ -50,6 +52,18 @@ impl Default for MapOptions {
     }
 }
 
+impl<'a> MapShape<'a> {
+    /// Its basis. Eigenvalues play no part in these maps.
+    fn basis(&self) -> Basis<'a> {
+        Basis {
+            eigenvalues: &[],
+            eigenvectors: self.eigenvectors,
+            n_eigenvectors: self.n_eigenvectors,
+            mass: self.mass,
+        }
+    }
+}
+
 /// The map from shape 1 to shape 2 (functions), with `p2p_21` from the vertices of 2 to those of 1.
 /// Costs about `2 n1 n2 (k + dim)` flops a round.
 pub fn descriptor_zoomout(
@@ -62,34 +76,27 @@ pub fn descriptor_zoomout(
         .min(one.n_eigenvectors)
         .min(two.n_eigenvectors)
         .max(1);
+    let (basis_1, basis_2) = (one.basis(), two.basis());
     let mut k = options.k_start.min(k_end);
     let mut p2p_21 = nearest_rows(two.descriptors, one.descriptors, one.dim);
-    let mut c_12 = project(one, two, &p2p_21, k);
-    let mean_norm = weighted_mean(one.mass, |v| squared_norm(row(one.descriptors, one.dim, v)));
+    let mut c_12 = functional(&basis_1, &basis_2, &p2p_21, k, k);
+    let mean_norm = mean_square(one);
     loop {
         let beta = (options.descriptor_weight * k as f32 / mean_norm.max(1e-12) as f32).sqrt();
-        let targets = embedded(one, &leading(one, k), k, beta);
-        let mut carried = Mat::<f32>::zeros(two.mass.len(), k);
-        matmul(
-            carried.as_mut(),
-            Accum::Replace,
-            leading(two, k).as_ref(),
-            c_12.as_ref(),
-            1.0,
-            Par::Seq,
-        );
+        let targets = embedded(one, &basis_1.leading(k), k, beta);
+        let carried = product(&basis_2.leading(k), &c_12, two.mass.len(), k, k);
         let queries = embedded(two, &carried, k, beta);
         p2p_21 = nearest_rows(&queries, &targets, k + one.dim);
-        c_12 = project(one, two, &p2p_21, (k + options.k_step).min(k_end));
+        let next = (k + options.k_step).min(k_end);
+        c_12 = functional(&basis_1, &basis_2, &p2p_21, next, next);
         if k == k_end {
             break;
         }
-        k = (k + options.k_step).min(k_end);
+        k = next;
     }
-    let quality = quality(one, two, &c_12, &p2p_21);
-    let c = (0..k_end).flat_map(|i| (0..k_end).map(move |j| (i, j)));
+    let quality = Quality::new(one, two, &c_12, k_end, &p2p_21);
     FunctionalMap {
-        c_12: c.map(|(i, j)| c_12[(i, j)]).collect(),
+        c_12,
         k1: k_end,
         k2: k_end,
         p2p_21,
@@ -97,104 +104,71 @@ pub fn descriptor_zoomout(
     }
 }
 
-fn row(values: &[f32], dim: usize, v: usize) -> &[f32] {
-    &values[v * dim..(v + 1) * dim]
-}
-
-fn squared_norm(x: &[f32]) -> f64 {
-    x.iter().map(|v| f64::from(v * v)).sum()
-}
-
-fn weighted_mean(mass: &[f32], value: impl Fn(usize) -> f64) -> f64 {
-    let total: f64 = mass.iter().map(|m| f64::from(*m)).sum();
-    let sum: f64 = mass
-        .iter()
-        .enumerate()
-        .map(|(v, m)| f64::from(*m) * value(v))
-        .sum();
-    sum / total.max(1e-300)
-}
-
-/// The first `k` eigenvectors `(n, k)`.
-fn leading(shape: &MapShape<'_>, k: usize) -> Mat<f32> {
-    Mat::from_fn(shape.mass.len(), k, |v, j| {
-        shape.eigenvectors[v * shape.n_eigenvectors + j]
-    })
-}
-
-/// Rows `[spectral (k), β descriptors (dim)]`, row-major.
-fn embedded(shape: &MapShape<'_>, spectral: &Mat<f32>, k: usize, beta: f32) -> Vec<f32> {
-    let n = shape.mass.len();
-    let mut out = Vec::with_capacity(n * (k + shape.dim));
-    for v in 0..n {
-        out.extend((0..k).map(|j| spectral[(v, j)]));
-        out.extend(
-            row(shape.descriptors, shape.dim, v)
-                .iter()
-                .map(|x| beta * x),
-        );
+/// ZoomOut as published, on all vertices: `rounds` times a pointwise map and a functional map that is larger by `step`;
+/// then the pointwise map of the last. `c_12` is `(k, k)`, row-major. O(rounds n1 n2 k).
+///
+/// # Panics
+/// If there are fewer than `k + rounds step` eigenvectors.
+pub fn zoomout(
+    one: &Basis<'_>,
+    two: &Basis<'_>,
+    c_12: &[f32],
+    k: usize,
+    step: usize,
+    rounds: usize,
+) -> (Vec<f32>, Vec<u32>) {
+    let (mut c, mut k) = (c_12.to_vec(), k);
+    for _ in 0..rounds {
+        let p2p_21 = pointwise(one, two, &c, k);
+        k += step;
+        c = functional(one, two, &p2p_21, k, k);
     }
-    out
+    let p2p_21 = pointwise(one, two, &c, k);
+    (c, p2p_21)
 }
 
-/// `Φ₂⁺ Φ₁[p2p_21] (k, k)` with `Φ₂⁺ = Φ₂ᵀ A₂`.
-fn project(one: &MapShape<'_>, two: &MapShape<'_>, p2p_21: &[u32], k: usize) -> Mat<f32> {
-    let n = two.mass.len();
-    let weighted: Vec<f32> = (0..n)
-        .flat_map(|v| {
-            let phi = &row(two.eigenvectors, two.n_eigenvectors, v)[..k];
-            phi.iter().map(move |x| x * two.mass[v])
-        })
-        .collect();
-    let pulled: Vec<f32> = p2p_21
-        .iter()
-        .flat_map(|t| {
-            row(one.eigenvectors, one.n_eigenvectors, *t as usize)[..k]
-                .iter()
-                .copied()
-        })
-        .collect();
-    let mut c = Mat::<f32>::zeros(k, k);
-    matmul(
-        c.as_mut(),
-        Accum::Replace,
-        MatRef::from_row_major_slice(&weighted, n, k).transpose(),
-        MatRef::from_row_major_slice(&pulled, n, k),
-        1.0,
-        Par::Seq,
-    );
+/// ZoomOut on samples, through the sizes `ks`: of `c_12 (k, k)`, a map of the last size. Functional maps by weighted
+/// least squares at the samples.
+pub fn zoomout_sampled(
+    one: &SampledBasis,
+    two: &SampledBasis,
+    c_12: &[f32],
+    k: usize,
+    ks: &[usize],
+) -> Vec<f32> {
+    let (mut c, mut k) = (c_12.to_vec(), k);
+    for &next in ks {
+        let targets = super::basis::product_transposed(&one.leading(k), &c, one.n, k, k);
+        let p2p_21 = nearest_rows(&two.leading(k), &targets, k);
+        let rows = columns(&one.rows, one.k, next);
+        let pulled = super::transfer::pulled_back(&p2p_21, &rows, next);
+        c = two.fit(&pulled, next, next);
+        k = next;
+    }
     c
 }
 
-fn quality(one: &MapShape<'_>, two: &MapShape<'_>, c_12: &Mat<f32>, p2p_21: &[u32]) -> Quality {
-    let descriptor_residual = weighted_mean(two.mass, |v| {
-        let a = row(two.descriptors, two.dim, v);
-        let b = row(one.descriptors, one.dim, p2p_21[v] as usize);
-        a.iter()
-            .zip(b)
-            .map(|(x, y)| f64::from((x - y) * (x - y)))
-            .sum()
-    });
-    let k = c_12.ncols();
-    let gram = c_12.transpose() * c_12;
-    let mut departure = 0.0;
-    let mut small = 0usize;
-    for i in 0..k {
-        for j in 0..k {
-            departure += f64::from(gram[(i, j)] - if i == j { 1.0 } else { 0.0 }).powi(2);
-            small += usize::from(c_12[(i, j)].abs() < 0.1);
-        }
+fn mean_square(shape: &MapShape<'_>) -> f64 {
+    let rows = shape
+        .descriptors
+        .chunks_exact(shape.dim.max(1))
+        .zip(shape.mass);
+    let sum: f64 = rows
+        .map(|(row, m)| f64::from(*m) * row.iter().map(|x| f64::from(x * x)).sum::<f64>())
+        .sum();
+    let total: f64 = shape.mass.iter().map(|m| f64::from(*m)).sum();
+    sum / total.max(1e-300)
+}
+
+/// Rows `[spectral (k), β descriptors (dim)]`, row-major.
+fn embedded(shape: &MapShape<'_>, spectral: &[f32], k: usize, beta: f32) -> Vec<f32> {
+    let mut out = Vec::with_capacity(shape.mass.len() * (k + shape.dim));
+    let descriptors = shape.descriptors.chunks_exact(shape.dim);
+    for (phi, x) in spectral.chunks_exact(k).zip(descriptors) {
+        out.extend_from_slice(phi);
+        out.extend(x.iter().map(|x| beta * x));
     }
-    let mut hit = vec![false; one.mass.len()];
-    for t in p2p_21 {
-        hit[*t as usize] = true;
-    }
-    Quality {
-        descriptor_residual,
-        orthogonality: (departure / k as f64).sqrt(),
-        coverage: weighted_mean(one.mass, |v| f64::from(u8::from(hit[v]))),
-        near_zero: small as f64 / (k * k) as f64,
-    }
+    out
 }
 
 #[cfg(test)]
@@ -248,6 +222,28 @@ mod tests {
         assert_eq!(map.p2p_21, expected);
         assert!(map.quality.orthogonality < 1e-3 && map.quality.coverage > 0.999);
         assert!(map.quality.descriptor_residual < 1e-9);
+    }
+
+    #[test]
+    fn a_small_exact_map_grows_to_a_large_one() {
+        use super::super::test_shapes::cycle as curve;
+        let (a, b) = (curve(150, 0), curve(150, 23));
+        let p2p: Vec<u32> = (0..150).map(|v| (v + 23) % 150).collect();
+        let c = functional(&a.basis(), &b.basis(), &p2p, 3, 3);
+        let (large, found) = zoomout(&a.basis(), &b.basis(), &c, 3, 2, 4);
+        assert_eq!((large.len(), found), (121, p2p.clone()));
+        // Samples that correspond: each third vertex of the one, and what it is matched with on the other.
+        let ids = |turn: u32| (0..50).map(|i| (3 * i + turn) % 150).collect::<Vec<u32>>();
+        let mass = vec![1.0 / 50.0; 50];
+        let one = SampledBasis::new(&a.basis(), &ids(23), &mass, 11);
+        let two = SampledBasis::new(&b.basis(), &ids(0), &mass, 11);
+        let sampled = zoomout_sampled(&one, &two, &c, 3, &[5, 7, 9, 11]);
+        let error: f32 = sampled
+            .iter()
+            .zip(&large)
+            .map(|(x, y)| (x - y).powi(2))
+            .sum();
+        assert!(error < 1e-4, "{error}");
     }
 
     #[test]

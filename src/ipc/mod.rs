@@ -7,6 +7,7 @@ pub mod client;
 pub mod convert;
 pub mod endpoint;
 pub mod frames;
+pub mod json;
 pub mod keys;
 
 /// The messages of `proto/coseg/v1`, as generated.

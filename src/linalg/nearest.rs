@@ -14,16 +14,160 @@ const BLOCK: usize = 256;
 /// # Panics
 /// If `targets` is empty or a length is not a multiple of `dim`.
 pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
-    assert!(dim > 0 && queries.len().is_multiple_of(dim) && targets.len().is_multiple_of(dim));
-    let n_targets = targets.len() / dim;
-    assert!(n_targets > 0, "nearest_rows needs at least one target");
-    let n_queries = queries.len() / dim;
-    let half_norms: Vec<f32> = targets
-        .chunks_exact(dim)
-        .map(|t| 0.5 * t.iter().map(|x| x * x).sum::<f32>())
+    let mut nearest = vec![0u32; queries.len() / dim.max(1)];
+    let mut best = vec![f32::INFINITY; nearest.len()];
+    let target_norms = half_norms(targets, dim);
+    products(queries, targets, dim, |q, t0, column| {
+        let (at, value) = least(column, &target_norms[t0..t0 + column.len()]);
+        if value < best[q] {
+            best[q] = value;
+            nearest[q] = (t0 + at) as u32;
+        }
+    });
+    nearest
+}
+
+/// As [`nearest_rows`], in both directions for the products of one: the nearest target of each query `(q,)` and
+/// the nearest query of each target `(t,)`.
+///
+/// # Panics
+/// If one side is empty or a length is not a multiple of `dim`.
+pub fn nearest_both(queries: &[f32], targets: &[f32], dim: usize) -> (Vec<u32>, Vec<u32>) {
+    assert!(!queries.is_empty(), "nearest_both needs at least one query");
+    let (query_norms, target_norms) = (half_norms(queries, dim), half_norms(targets, dim));
+    let mut of_query = vec![0u32; query_norms.len()];
+    let mut best_of_query = vec![f32::INFINITY; query_norms.len()];
+    let mut of_target = vec![0u32; target_norms.len()];
+    let mut best_of_target = vec![f32::INFINITY; target_norms.len()];
+    products(queries, targets, dim, |q, t0, column| {
+        let (at, value) = least(column, &target_norms[t0..t0 + column.len()]);
+        if value < best_of_query[q] {
+            best_of_query[q] = value;
+            of_query[q] = (t0 + at) as u32;
+        }
+        let best = &mut best_of_target[t0..t0 + column.len()];
+        let at = &mut of_target[t0..t0 + column.len()];
+        for ((b, at), p) in best.iter_mut().zip(at).zip(column) {
+            let value = query_norms[q] - p;
+            let less = value < *b;
+            *b = if less { value } else { *b };
+            *at = if less { q as u32 } else { *at };
+        }
+    });
+    (of_query, of_target)
+}
+
+/// As [`nearest_rows`], but targets are in cells `(t,)`, each with a centre that is a target, and only the
+/// `n_probed` cells with the nearest centres are searched (all, if there are no more). Near enough to exact where
+/// cells are small; costs `2 q (cells + n_probed t / cells) dim` flops.
+///
+/// # Panics
+/// If `targets` is empty, a length is not a multiple of `dim` or a centre or cell does not exist.
+pub fn nearest_in_cells(
+    queries: &[f32],
+    targets: &[f32],
+    dim: usize,
+    centres: &[u32],
+    cell: &[u32],
+    n_probed: usize,
+) -> Vec<u32> {
+    if centres.len() <= n_probed {
+        return nearest_rows(queries, targets, dim);
+    }
+    let n_cells = centres.len();
+    let mut offsets = vec![0usize; n_cells + 1];
+    for c in cell {
+        offsets[*c as usize + 1] += 1;
+    }
+    for c in 0..n_cells {
+        offsets[c + 1] += offsets[c];
+    }
+    let mut next = offsets.clone();
+    let mut members = vec![0u32; cell.len()];
+    for (t, c) in cell.iter().enumerate() {
+        members[next[*c as usize]] = t as u32;
+        next[*c as usize] += 1;
+    }
+    let row = |t: u32| &targets[t as usize * dim..(t as usize + 1) * dim];
+    let grouped: Vec<f32> = members
+        .iter()
+        .flat_map(|&t| row(t).iter().copied())
         .collect();
+    let centre_rows: Vec<f32> = centres
+        .iter()
+        .flat_map(|&t| row(t).iter().copied())
+        .collect();
+    let centre_norms = half_norms(&centre_rows, dim);
+    let norms = half_norms(&grouped, dim);
+    let n_queries = queries.len() / dim;
+    // The nearest cells of each query, by insertion: their number is small.
+    let mut cells = vec![(f32::INFINITY, u32::MAX); n_queries * n_probed];
+    products(queries, &centre_rows, dim, |q, c0, column| {
+        let probed = &mut cells[q * n_probed..(q + 1) * n_probed];
+        for (i, p) in column.iter().enumerate() {
+            let value = centre_norms[c0 + i] - p;
+            if value < probed[n_probed - 1].0 {
+                let at = probed.partition_point(|x| x.0 <= value);
+                probed[at..].rotate_right(1);
+                probed[at] = (value, (c0 + i) as u32);
+            }
+        }
+    });
     let mut nearest = vec![0u32; n_queries];
-    let mut best = vec![f32::INFINITY; n_queries];
+    for q in 0..n_queries {
+        let query = &queries[q * dim..(q + 1) * dim];
+        let mut best = (f32::INFINITY, u32::MAX);
+        for &(_, c) in &cells[q * n_probed..(q + 1) * n_probed] {
+            for at in offsets[c as usize]..offsets[c as usize + 1] {
+                let value = norms[at] - dot(query, &grouped[at * dim..(at + 1) * dim]);
+                if value < best.0 || (value == best.0 && members[at] < best.1) {
+                    best = (value, members[at]);
+                }
+            }
+        }
+        nearest[q] = best.1;
+    }
+    nearest
+}
+
+/// Eight independent sums, so that the compiler can keep them in vector registers.
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; 8];
+    let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));
+    let rest: f32 = a8
+        .remainder()
+        .iter()
+        .zip(b8.remainder())
+        .map(|(x, y)| x * y)
+        .sum();
+    for (x, y) in a8.zip(b8) {
+        for lane in 0..8 {
+            sums[lane] += x[lane] * y[lane];
+        }
+    }
+    sums.iter().sum::<f32>() + rest
+}
+
+fn half_norms(rows: &[f32], dim: usize) -> Vec<f32> {
+    let rows = rows.chunks_exact(dim.max(1));
+    rows.map(|t| 0.5 * t.iter().map(|x| x * x).sum::<f32>())
+        .collect()
+}
+
+/// Calls `visit(query, first target, products with the targets from there)`, block by block; queries ascend within
+/// a block of targets, and the other way round.
+fn products(
+    queries: &[f32],
+    targets: &[f32],
+    dim: usize,
+    mut visit: impl FnMut(usize, usize, &[f32]),
+) {
+    assert!(dim > 0 && queries.len().is_multiple_of(dim) && targets.len().is_multiple_of(dim));
+    let (n_queries, n_targets) = (queries.len() / dim, targets.len() / dim);
+    assert!(
+        n_targets > 0,
+        "the nearest of no rows: at least one target is needed"
+    );
     // Column q of the product holds query q against a block of targets: contiguous for the scan.
     let mut product = Mat::<f32>::zeros(BLOCK.min(n_targets), BLOCK.min(n_queries.max(1)));
     for q0 in (0..n_queries).step_by(BLOCK) {
@@ -46,15 +190,10 @@ pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
                 let Some(column) = column.try_as_col_major() else {
                     unreachable!("owned columns")
                 };
-                let (at, value) = least(column.as_slice(), &half_norms[t0..t0 + nt]);
-                if value < best[q0 + j] {
-                    best[q0 + j] = value;
-                    nearest[q0 + j] = (t0 + at) as u32;
-                }
+                visit(q0 + j, t0, column.as_slice());
             }
         }
     }
-    nearest
 }
 
 /// Index and value of the least `half_norm − product`; the lowest index on ties.
@@ -99,6 +238,12 @@ mod tests {
             let queries: Vec<f32> = (0..q * dim).map(|_| rng.random_range(-1.0..1.0)).collect();
             let targets: Vec<f32> = (0..t * dim).map(|_| rng.random_range(-1.0..1.0)).collect();
             let found = nearest_rows(&queries, &targets, dim);
+            let back = nearest_rows(&targets, &queries, dim);
+            assert_eq!(
+                nearest_both(&queries, &targets, dim),
+                (found.clone(), back),
+                "{q}x{t}x{dim}"
+            );
             for (i, &f) in found.iter().enumerate() {
                 let distance = |j: usize| -> f32 {
                     (0..dim)

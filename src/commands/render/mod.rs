@@ -1,6 +1,7 @@
 //! `coseg render`: a collection as one picture, each shape in the colours of its labels.
 
 mod canvas;
+pub(crate) mod pair;
 mod view;
 
 use super::export::original;

@@ -1,9 +1,10 @@
 //! Arrays of descriptions, maps between shapes.
 
-use crate::fmap::Quality;
-use crate::ipc::frames::FrameWriter;
-use crate::ipc::wire;
-use crate::library::{MapInfo, PartMatch};
+use super::errors::{field_error, frame_error};
+use crate::fmap::{PointMap, Quality, Side};
+use crate::ipc::frames::{FrameReader, FrameWriter};
+use crate::ipc::wire::{self, ErrorReason};
+use crate::library::{MapInfo, PartMatch, PointRequest, PolygonValues};
 use crate::pipeline::DescriptionView;
 
 /// Eigenvalues, and eigenvectors with the mass if they are wanted; `area` in squared input units.
@@ -51,6 +52,92 @@ fn quality(q: &Quality) -> wire::MapQuality {
         orthogonality: q.orthogonality,
         coverage: q.coverage,
         near_zero: q.near_zero,
+        ..wire::MapQuality::default()
+    }
+}
+
+fn point_quality(map: &PointMap) -> wire::MapQuality {
+    wire::MapQuality {
+        round_trip: Some(map.assessment.round_trip),
+        smoothness: Some(map.assessment.smoothness),
+        orientation: Some(map.orientation),
+        expected_error: Some(map.expected_error),
+        ..quality(&map.quality)
+    }
+}
+
+/// What is asked of a map between points.
+pub fn point_request(options: &wire::PointMapOptions) -> PointRequest {
+    PointRequest {
+        landmarks: options.landmarks.iter().map(|l| [l.from, l.to]).collect(),
+        side: match options.orientation() {
+            wire::MapOrientation::Unspecified => Side::Preferred,
+            wire::MapOrientation::Keep => Side::Keep,
+            wire::MapOrientation::Reverse => Side::Reverse,
+        },
+        k: options.k as usize,
+        alternative: options.alternative,
+    }
+}
+
+/// A map between points and perhaps its alternative.
+pub fn point_maps(maps: &[PointMap], frames: &mut FrameWriter) -> wire::GetFunctionalMapReply {
+    let mut reply = wire::GetFunctionalMapReply::default();
+    if let Some(map) = maps.first() {
+        reply.c_12 = Some(frames.f32_array(&map.c_12, &[map.k, map.k]));
+        reply.p2p_21 = Some(frames.u32_array(&map.p2p_21, &[map.p2p_21.len()]));
+        reply.quality = Some(point_quality(map));
+        if let Some(other) = maps.get(1) {
+            reply.alternative_c_12 = Some(frames.f32_array(&other.c_12, &[other.k, other.k]));
+            reply.alternative_p2p_21 = Some(frames.u32_array(&other.p2p_21, &[other.p2p_21.len()]));
+            reply.alternative_quality = Some(point_quality(other));
+            reply.alternative_cost = Some(other.cost / map.cost.max(1e-300));
+        }
+    }
+    reply
+}
+
+/// Values at polygons: int32 labels with one axis, or float32 functions with one or two.
+pub fn polygon_values(
+    values: Option<&wire::ArrayRef>,
+    frames: FrameReader<'_>,
+) -> Result<PolygonValues, wire::Error> {
+    let field = "values";
+    let axes = |n: usize, most: usize| {
+        let text = format!("{field} has {n} axes, but may have 1 to {most}");
+        field_error(ErrorReason::FieldRange, field, text)
+    };
+    if values.map(wire::ArrayRef::dtype) == Some(wire::DataType::Int32) {
+        let read = frames.i32_array(values, field);
+        let (labels, extents) = read.map_err(|e| frame_error(&e))?;
+        return match extents[..] {
+            [_] => Ok(PolygonValues::Labels(labels)),
+            _ => Err(axes(extents.len(), 1)),
+        };
+    }
+    let read = frames.f32_array(values, field);
+    let (functions, extents) = read.map_err(|e| frame_error(&e))?;
+    match extents[..] {
+        [_] => Ok(PolygonValues::Functions(functions, 1)),
+        [_, dim] if dim > 0 => Ok(PolygonValues::Functions(functions, dim)),
+        _ => Err(axes(extents.len(), 2)),
+    }
+}
+
+/// Values that were carried.
+pub fn transferred(
+    values: &PolygonValues,
+    map: &PointMap,
+    frames: &mut FrameWriter,
+) -> wire::TransferFunctionReply {
+    let values = match values {
+        PolygonValues::Labels(labels) => frames.i32_array(labels, &[labels.len()]),
+        PolygonValues::Functions(x, 1) => frames.f32_array(x, &[x.len()]),
+        PolygonValues::Functions(x, dim) => frames.f32_array(x, &[x.len() / dim, *dim]),
+    };
+    wire::TransferFunctionReply {
+        values: Some(values),
+        quality: Some(point_quality(map)),
     }
 }
 
@@ -60,6 +147,7 @@ pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunct
         c_12: Some(frames.f32_array(&map.c_12, &[map.k2, map.k1])),
         p2p_21: Some(frames.u32_array(&map.p2p_21, &[map.p2p_21.len()])),
         quality: Some(quality(&map.quality)),
+        ..wire::GetFunctionalMapReply::default()
     }
 }
 

@@ -1,0 +1,353 @@
+//! `coseg bench maps`: how good maps between points are on meshes whose correspondence is known.
+
+use super::session::{print_line, table};
+use super::{CommandError, Outcome};
+use crate::cli::Global;
+use clap::Args;
+use coseg::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
+use coseg::mesh::{self, EdgeGraph, FaceGeometry, Format, TriMesh};
+use coseg::operators::{Operator, laplacian};
+use coseg::spectrum::{Options, Spectrum};
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Eigenpairs of each mesh.
+const K: usize = 100;
+/// Points of each mesh at which errors are taken, spread evenly over those that are known.
+const MAX_POINTS: usize = 500;
+
+/// `coseg bench maps`
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BenchMaps {
+    /// Folder with folders of meshes: NAME.off, and NAME.vts, whose line i is the number, from 1, of the vertex at point i;
+    /// perhaps NAME.sym.vts, where that point lies mirrored. Meshes whose names begin with the same letters make a set
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Two meshes and a file that has, for each vertex of the second, the number of a vertex of the first, from 0
+    #[arg(long, num_args = 3, value_names = ["FROM.off", "TO.off", "TRUTH"])]
+    pair: Option<Vec<PathBuf>>,
+    /// Only every Nth pair
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    stride: u32,
+}
+
+/// A mesh with its spectrum; of area 1, and with the vertices of its file.
+struct Meshed {
+    vertices: Vec<[f32; 3]>,
+    faces: Vec<[u32; 3]>,
+    graph: EdgeGraph,
+    eigenvalues: Vec<f64>,
+    eigenvectors: Vec<f32>,
+    mass: Vec<f32>,
+}
+
+/// Vertices at the known points of a mesh, and where these lie mirrored.
+struct Known {
+    at: Vec<u32>,
+    mirrored: Vec<u32>,
+    /// Distances from the points at which errors are taken, with which points these are.
+    distances: Vec<(usize, Vec<f64>)>,
+}
+
+/// Errors of one map, in units of the square root of the area.
+struct Score {
+    counted: f64,
+    forgiven: f64,
+    expected: f64,
+    estimate_ms: f64,
+}
+
+pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
+    let mut rows = Vec::new();
+    let mut scores = Vec::new();
+    for (set, files) in sets(&args.data)? {
+        let found = bench_set(&files, args.stride as usize)?;
+        if !global.json {
+            eprintln!("{set}: {} pairs", found.len());
+        }
+        rows.push((set, mean(&found)));
+        scores.extend(found);
+    }
+    if let Some([from, to, truth]) = args.pair.as_deref() {
+        let found = bench_pair(from, to, truth)?;
+        let name = |p: &Path| {
+            p.file_stem()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned()
+        };
+        rows.push((format!("{} to {}", name(from), name(to)), mean(&[found])));
+    }
+    let calibration = calibration(&mut scores);
+    if global.json {
+        let sets: Vec<_> = rows
+            .iter()
+            .map(|(set, m)| json!({"set": set, "pairs": m.0, "counted": m.1, "forgiven": m.2, "estimate_ms": m.3}))
+            .collect();
+        let bins: Vec<_> = calibration
+            .iter()
+            .map(|b| json!({"maps": b.0, "expected": b.1, "actual": b.2}))
+            .collect();
+        print_line(&json!({"sets": sets, "calibration": bins}).to_string())?;
+        return Ok(true);
+    }
+    let head = ["set", "pairs", "error", "mirror forgiven", "ms"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    lines.extend(rows.iter().map(|(set, m)| {
+        vec![
+            set.clone(),
+            m.0.to_string(),
+            format!("{:.4}", m.1),
+            format!("{:.4}", m.2),
+            format!("{:.0}", m.3),
+        ]
+    }));
+    print_line(&table(&lines))?;
+    let mut lines = vec![
+        ["maps", "error to expect", "error"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+    lines.extend(calibration.iter().map(|b| {
+        vec![
+            b.0.to_string(),
+            format!("{:.3}", b.1),
+            format!("{:.3}", b.2),
+        ]
+    }));
+    print_line(&table(&lines))?;
+    Ok(true)
+}
+
+/// Pairs, mean error, mean forgiven error, mean time.
+fn mean(scores: &[Score]) -> (usize, f64, f64, f64) {
+    let over =
+        |f: &dyn Fn(&Score) -> f64| scores.iter().map(f).sum::<f64>() / scores.len().max(1) as f64;
+    (
+        scores.len(),
+        over(&|s| s.counted),
+        over(&|s| s.forgiven),
+        over(&|s| s.estimate_ms),
+    )
+}
+
+/// Quintiles of the expected error: maps, mean expected and mean actual error.
+fn calibration(scores: &mut [Score]) -> Vec<(usize, f64, f64)> {
+    scores.sort_by(|a, b| a.expected.total_cmp(&b.expected));
+    let size = scores.len().div_ceil(5).max(1);
+    let of = |bin: &[Score], f: &dyn Fn(&Score) -> f64| {
+        bin.iter().map(f).sum::<f64>() / bin.len() as f64
+    };
+    scores
+        .chunks(size)
+        .map(|bin| {
+            (
+                bin.len(),
+                of(bin, &|s| s.expected),
+                of(bin, &|s| s.forgiven),
+            )
+        })
+        .collect()
+}
+
+/// Meshes by set, both in order.
+fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, CommandError> {
+    let file = |path: &Path| {
+        let path = path.display().to_string();
+        move |source| CommandError::File { path, source }
+    };
+    let mut folders = vec![data.to_path_buf()];
+    let mut sets: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).map_err(file(&folder))? {
+            let path = entry.map_err(file(&folder))?.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "off")
+                && path.with_extension("vts").exists()
+            {
+                let stem = path
+                    .file_stem()
+                    .unwrap_or_default()
+                    .to_string_lossy()
+                    .into_owned();
+                let set = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+                sets.entry(set.trim_end_matches(['_', '-']).to_owned())
+                    .or_default()
+                    .push(path);
+            }
+        }
+    }
+    sets.values_mut().for_each(|files| files.sort());
+    if sets.is_empty() {
+        return Err(CommandError::Failed(format!(
+            "{}: no NAME.off with NAME.vts",
+            data.display()
+        )));
+    }
+    Ok(sets)
+}
+
+fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, CommandError> {
+    let text = std::fs::read_to_string(path).map_err(|source| CommandError::File {
+        path: path.display().to_string(),
+        source,
+    })?;
+    let number = |word: &str| {
+        let n = word.parse::<u32>().ok().and_then(|n| n.checked_sub(first));
+        n.ok_or_else(|| CommandError::Failed(format!("{}: {word:?} is no vertex", path.display())))
+    };
+    text.split_whitespace().map(number).collect()
+}
+
+fn load(path: &Path) -> Result<Meshed, CommandError> {
+    let failed =
+        |e: &dyn std::fmt::Display| CommandError::Failed(format!("{}: {e}", path.display()));
+    let bytes = std::fs::read(path).map_err(|source| CommandError::File {
+        path: path.display().to_string(),
+        source,
+    })?;
+    let parsed = mesh::parse(&bytes, Format::Off).map_err(|e| failed(&e))?;
+    let mut whole = TriMesh {
+        vertices: parsed.vertices,
+        faces: parsed.triangles,
+    };
+    let area: f64 = FaceGeometry::new(&whole).areas.iter().sum();
+    let scale = area.sqrt().recip();
+    whole
+        .vertices
+        .iter_mut()
+        .for_each(|v| *v = v.map(|x| x * scale));
+    let bridges = mesh::bridges(&whole);
+    let operator = laplacian(&whole, &bridges, Operator::Tufted).map_err(|e| failed(&e))?;
+    let k = K.min(whole.vertices.len());
+    let options = Options::default();
+    let found = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)
+        .map_err(|e| failed(&e))?;
+    Ok(Meshed {
+        graph: EdgeGraph::new(&whole, &bridges),
+        vertices: whole.vertices.iter().map(|v| v.map(|x| x as f32)).collect(),
+        faces: whole.faces,
+        eigenvectors: found
+            .eigenvectors
+            .transpose()
+            .iter()
+            .map(|x| *x as f32)
+            .collect(),
+        eigenvalues: found.eigenvalues,
+        mass: operator.mass.iter().map(|m| *m as f32).collect(),
+    })
+}
+
+impl Meshed {
+    fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
+        let basis = Basis {
+            eigenvalues: &self.eigenvalues,
+            eigenvectors: &self.eigenvectors,
+            n_eigenvectors: self.eigenvalues.len(),
+            mass: &self.mass,
+        };
+        PointShape::new(&self.vertices, &self.faces, basis, options)
+    }
+
+    /// Distances from points spread evenly over `at`.
+    fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
+        let count = at.len().min(MAX_POINTS);
+        let points = (0..count).map(|i| i * at.len() / count);
+        let distances = points.map(|p| (p, self.graph.dijkstra(at[p]))).collect();
+        Known {
+            at,
+            mirrored,
+            distances,
+        }
+    }
+}
+
+/// Mean error of a map to a shape with these points, and the same against the mirrored ones.
+fn errors(from: &Known, to: &Known, map: &PointMap) -> (f64, f64) {
+    let error = |at: &[u32]| {
+        let each = from.distances.iter().filter_map(|(p, distance)| {
+            let there = map.p2p_21.get(*at.get(*p)? as usize)?;
+            distance.get(*there as usize)
+        });
+        let (sum, count) = each.fold((0.0, 0usize), |(s, n), d| (s + d, n + 1));
+        if count > 0 {
+            sum / count as f64
+        } else {
+            f64::INFINITY
+        }
+    };
+    let direct = error(&to.at);
+    (direct, direct.min(error(&to.mirrored)))
+}
+
+fn scored(
+    one: (&PointShape<'_>, &Known),
+    two: (&PointShape<'_>, &Known),
+    options: &EstimateOptions,
+) -> Score {
+    let begin = Instant::now();
+    let maps = point_maps(one.0, two.0, &[], options);
+    let estimate_ms = begin.elapsed().as_secs_f64() * 1e3;
+    let (counted, forgiven) = errors(one.1, two.1, &maps[0]);
+    Score {
+        counted,
+        forgiven,
+        expected: maps[0].expected_error,
+        estimate_ms,
+    }
+}
+
+fn options() -> EstimateOptions {
+    EstimateOptions {
+        side: Side::Preferred,
+        alternative: false,
+        ..EstimateOptions::default()
+    }
+}
+
+/// All ordered pairs of a set, or every so many of them.
+fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, CommandError> {
+    let options = options();
+    let mut meshes = Vec::new();
+    for file in files {
+        let mirrored = file.with_extension("sym.vts");
+        let mirrored = if mirrored.exists() {
+            numbers(&mirrored, 1)?
+        } else {
+            Vec::new()
+        };
+        let meshed = load(file)?;
+        let known = meshed.known(numbers(&file.with_extension("vts"), 1)?, mirrored);
+        meshes.push((meshed, known));
+    }
+    let shapes: Vec<_> = meshes
+        .iter()
+        .map(|(m, known)| (m.shape(&options), known))
+        .collect();
+    let n = shapes.len();
+    let pairs = (0..n).flat_map(|i| (0..n).filter(move |j| *j != i).map(move |j| (i, j)));
+    let scores = pairs.step_by(stride).map(|(i, j)| {
+        let ((a, known_a), (b, known_b)) = (&shapes[i], &shapes[j]);
+        scored((a, known_a), (b, known_b), &options)
+    });
+    Ok(scores.collect())
+}
+
+/// A pair of which every vertex of the second is known on the first.
+fn bench_pair(from: &Path, to: &Path, truth: &Path) -> Result<Score, CommandError> {
+    let options = options();
+    let (one, two) = (load(from)?, load(to)?);
+    let truth = numbers(truth, 0)?;
+    let all = (0..truth.len() as u32).collect();
+    let (a, b) = (one.shape(&options), two.shape(&options));
+    let known = one.known(truth, Vec::new());
+    let target = Known {
+        at: all,
+        mirrored: Vec::new(),
+        distances: Vec::new(),
+    };
+    Ok(scored((&a, &known), (&b, &target), &options))
+}

@@ -1,0 +1,59 @@
+//! Functional maps become pointwise maps and back.
+//!
+//! Ovsjanikov et al. 2012, *Functional Maps*; Ezuz and Ben-Chen 2017, *Deblurring and Denoising of Maps between
+//! Shapes*. A vertex is its delta function, and two vertices are as far apart as their deltas in a spectral basis.
+
+use super::basis::{Basis, product, product_transposed};
+use crate::linalg::nearest::nearest_rows;
+
+/// `c_12 (k2, k1)` of a pointwise map `p2p_21 (n2,)`: `Φ₂ᵀ A₂ Φ₁[p2p_21]`, row-major. O(n2 k1 k2).
+///
+/// # Panics
+/// If there are fewer eigenvectors, or a vertex of the map does not exist.
+pub fn functional(
+    one: &Basis<'_>,
+    two: &Basis<'_>,
+    p2p_21: &[u32],
+    k1: usize,
+    k2: usize,
+) -> Vec<f32> {
+    two.project(&one.rows(p2p_21, k1), k1, k2)
+}
+
+/// `p2p_21 (n2,)` of a functional map `c_12 (k2, k1)`: for each row of `Φ₂` the nearest row of `Φ₁ c_12ᵀ`, as ZoomOut
+/// and pyFM take it. O(n1 n2 k2).
+pub fn pointwise(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize) -> Vec<u32> {
+    let k2 = c_12.len() / k1;
+    let targets = product_transposed(&one.leading(k1), c_12, one.n_vertices(), k1, k2);
+    nearest_rows(&two.leading(k2), &targets, k2)
+}
+
+/// As [`pointwise`], by the adjoint: for each row of `Φ₂ c_12` the nearest row of `Φ₁`. The same only for an
+/// orthogonal map.
+pub fn pointwise_adjoint(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize) -> Vec<u32> {
+    let k2 = c_12.len() / k1;
+    let queries = product(&two.leading(k2), c_12, two.n_vertices(), k2, k1);
+    nearest_rows(&queries, &one.leading(k1), k1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_shapes::cycle;
+    use super::{functional, pointwise, pointwise_adjoint};
+
+    #[test]
+    fn there_and_back_is_the_same_map() {
+        let (a, b) = (cycle(120, 0), cycle(120, 17));
+        let p2p: Vec<u32> = (0..120).map(|v| (v + 17) % 120).collect();
+        let c = functional(&a.basis(), &b.basis(), &p2p, 9, 11);
+        assert_eq!(c.len(), 99);
+        let c = functional(&a.basis(), &b.basis(), &p2p, 11, 11);
+        assert_eq!(pointwise(&a.basis(), &b.basis(), &c, 11), p2p);
+        assert_eq!(pointwise_adjoint(&a.basis(), &b.basis(), &c, 11), p2p);
+        // A turned cycle is an isometry: the map is orthogonal.
+        for i in 0..11 {
+            let norm: f32 = (0..11).map(|j| c[i * 11 + j].powi(2)).sum();
+            assert!((norm - 1.0).abs() < 1e-4, "row {i}: {norm}");
+        }
+    }
+}

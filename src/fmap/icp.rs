@@ -1,0 +1,61 @@
+//! A functional map becomes an orthogonal one that agrees with its pointwise map (Ovsjanikov et al. 2012, section 6.2).
+
+use super::basis::Basis;
+use super::convert::{functional, pointwise};
+use nalgebra::DMatrix;
+
+/// `rounds` times: pointwise map, functional map, nearest orthogonal one. `c_12 (k2, k1)` row-major.
+pub fn icp(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize, rounds: usize) -> Vec<f32> {
+    let k2 = c_12.len() / k1.max(1);
+    let mut c = c_12.to_vec();
+    for _ in 0..rounds {
+        let p2p_21 = pointwise(one, two, &c, k1);
+        c = nearest_orthogonal(&functional(one, two, &p2p_21, k1, k2), k1);
+    }
+    c
+}
+
+/// The matrix with orthonormal rows or columns, whichever are fewer, that is nearest to `c (k2, k1)`.
+pub fn nearest_orthogonal(c: &[f32], k1: usize) -> Vec<f32> {
+    let k2 = c.len() / k1.max(1);
+    let svd = DMatrix::from_fn(k2, k1, |i, j| f64::from(c[i * k1 + j])).svd(true, true);
+    let (Some(u), Some(v)) = (svd.u, svd.v_t) else {
+        unreachable!("invariant: both were asked for")
+    };
+    let product = u * v;
+    product.transpose().iter().map(|x| *x as f32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::basis::transposed_product;
+    use super::super::convert::functional;
+    use super::super::test_shapes::cycle;
+    use super::{icp, nearest_orthogonal};
+
+    #[test]
+    fn the_result_is_orthogonal() {
+        let c: Vec<f32> = (0..20).map(|i| ((i * 7 % 11) as f32).sin()).collect();
+        let q = nearest_orthogonal(&c, 4);
+        let gram = transposed_product(&q, &q, 5, 4, 4);
+        for (i, g) in gram.iter().enumerate() {
+            let one = f32::from(u8::from(i / 4 == i % 4));
+            assert!((g - one).abs() < 1e-5);
+        }
+    }
+
+    #[test]
+    fn a_disturbed_isometry_is_found_again() {
+        let (a, b) = (cycle(200, 0), cycle(200, 31));
+        let p2p: Vec<u32> = (0..200).map(|v| (v + 31) % 200).collect();
+        let c = functional(&a.basis(), &b.basis(), &p2p, 11, 11);
+        let disturbed: Vec<f32> = c
+            .iter()
+            .enumerate()
+            .map(|(i, x)| x + 0.05 * ((i * i) as f32).sin())
+            .collect();
+        let found = icp(&a.basis(), &b.basis(), &disturbed, 11, 5);
+        let error: f32 = found.iter().zip(&c).map(|(x, y)| (x - y).powi(2)).sum();
+        assert!(error < 1e-6, "{error}");
+    }
+}

@@ -1,0 +1,177 @@
+//! A map becomes figures that say how far it can be trusted.
+
+use super::basis::{Basis, product, transposed_product};
+use super::zoomout::MapShape;
+use crate::linalg::nearest::nearest_rows;
+
+/// Vertices that are sent there and back, spread evenly over the numbering.
+const MAX_RETURNED: usize = 500;
+
+/// How good a map is, as kept with it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Quality {
+    /// Mass-weighted mean squared descriptor difference between matched vertices; 0 is perfect.
+    pub descriptor_residual: f64,
+    /// `‖CᵀC − I‖_F / √k`; 0 for an isometry.
+    pub orthogonality: f64,
+    /// Share of the mass of shape 1 that is hit, 0 to 1.
+    pub coverage: f64,
+    /// Share of entries of C with magnitude below 0.1 (Yang and Tian report at least 0.9).
+    pub near_zero: f64,
+}
+
+/// What the two shapes and the map say besides, without ground truth.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Assessment {
+    /// Mean distance, in units of the square root of the area, between a vertex of shape 1 and where it comes back to
+    /// when it is mapped to shape 2 and from there by `p2p_21`.
+    pub round_trip: f64,
+    /// Dirichlet energy of the coordinates of shape 1 carried to shape 2 over that of shape 2's own: near 1 for a
+    /// smooth map, large for a torn one.
+    pub smoothness: f64,
+}
+
+impl Quality {
+    /// Of a map `c_12 (k2, k1)` with its pointwise map.
+    pub fn new(
+        one: &MapShape<'_>,
+        two: &MapShape<'_>,
+        c_12: &[f32],
+        k1: usize,
+        p2p_21: &[u32],
+    ) -> Self {
+        let dim = one.dim;
+        let rows = two.descriptors.chunks_exact(dim).zip(p2p_21).zip(two.mass);
+        let (mut difference, mut total) = (0.0, 0.0);
+        for ((x, t), mass) in rows {
+            let y = &one.descriptors[*t as usize * dim..(*t as usize + 1) * dim];
+            let d: f64 = x
+                .iter()
+                .zip(y)
+                .map(|(x, y)| f64::from((x - y) * (x - y)))
+                .sum();
+            difference += f64::from(*mass) * d;
+            total += f64::from(*mass);
+        }
+        Self {
+            descriptor_residual: difference / f64::max(total, 1e-300),
+            ..Self::of_map(one.mass, c_12, k1, p2p_21)
+        }
+    }
+
+    /// The same but for the descriptor residual, which stays 0.
+    pub fn of_map(mass_1: &[f32], c_12: &[f32], k1: usize, p2p_21: &[u32]) -> Self {
+        let k2 = c_12.len() / k1.max(1);
+        let gram = transposed_product(c_12, c_12, k2, k1, k1);
+        let entries = gram.iter().enumerate();
+        let departure: f64 = entries
+            .map(|(i, g)| f64::from(g - if i / k1 == i % k1 { 1.0 } else { 0.0 }).powi(2))
+            .sum();
+        let small = c_12.iter().filter(|x| x.abs() < 0.1).count();
+        let mut hit = vec![false; mass_1.len()];
+        for t in p2p_21 {
+            hit[*t as usize] = true;
+        }
+        let (mut covered, mut total) = (0.0, 0.0);
+        for (hit, mass) in hit.iter().zip(mass_1) {
+            total += f64::from(*mass);
+            covered += if *hit { f64::from(*mass) } else { 0.0 };
+        }
+        Self {
+            descriptor_residual: 0.0,
+            orthogonality: (departure / k1.max(1) as f64).sqrt(),
+            coverage: covered / f64::max(total, 1e-300),
+            near_zero: small as f64 / c_12.len().max(1) as f64,
+        }
+    }
+}
+
+impl Assessment {
+    /// Of a map `c_12 (k2, k1)` with its pointwise map, between shapes of area 1. One nearest-neighbour search.
+    pub fn new(
+        one: (&Basis<'_>, &[[f32; 3]]),
+        two: (&Basis<'_>, &[[f32; 3]], &[[u32; 3]]),
+        c_12: &[f32],
+        k1: usize,
+        p2p_21: &[u32],
+    ) -> Self {
+        let k2 = c_12.len() / k1.max(1);
+        // The map back by the same C: some rows of Φ₁ against those of Φ₂ C.
+        let step = one.0.n_vertices().div_ceil(MAX_RETURNED).max(1);
+        let vertices: Vec<u32> = (0..one.0.n_vertices() as u32).step_by(step).collect();
+        let targets = product(&two.0.leading(k2), c_12, two.0.n_vertices(), k2, k1);
+        let back = nearest_rows(&one.0.rows(&vertices, k1), &targets, k1);
+        let (mut sum, mut total) = (0.0, 0.0);
+        for (&v, there) in vertices.iter().zip(&back) {
+            let (a, b) = (one.1[v as usize], one.1[p2p_21[*there as usize] as usize]);
+            let d: f32 = (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
+            sum += f64::from(one.0.mass[v as usize] * d);
+            total += f64::from(one.0.mass[v as usize]);
+        }
+        let carried = |v: u32| one.1[p2p_21[v as usize] as usize];
+        let own = dirichlet(two.2, two.1, |v| two.1[v as usize]);
+        Self {
+            round_trip: sum / f64::max(total, 1e-300),
+            smoothness: dirichlet(two.2, two.1, carried) / own.max(1e-300),
+        }
+    }
+}
+
+/// Dirichlet energy of three functions on a mesh; triangles without area are left out.
+fn dirichlet(faces: &[[u32; 3]], vertices: &[[f32; 3]], value: impl Fn(u32) -> [f32; 3]) -> f64 {
+    let difference =
+        |a: [f32; 3], b: [f32; 3]| -> [f64; 3] { std::array::from_fn(|i| f64::from(a[i] - b[i])) };
+    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let mut energy = 0.0;
+    for face in faces {
+        let p = face.map(|v| vertices[v as usize]);
+        let f = face.map(&value);
+        let (u, w) = (difference(p[1], p[0]), difference(p[2], p[0]));
+        let doubled = (dot(u, u) * dot(w, w) - dot(u, w).powi(2)).max(0.0).sqrt();
+        if doubled < 1e-12 {
+            continue;
+        }
+        for i in 0..3 {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            let (a, b) = (difference(p[j], p[i]), difference(p[k], p[i]));
+            let d = difference(f[k], f[j]);
+            energy += 0.5 * dot(a, b) / doubled * dot(d, d);
+        }
+    }
+    energy
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::convert::functional;
+    use super::super::test_shapes::cycle;
+    use super::{Quality, dirichlet};
+
+    #[test]
+    fn an_isometry_is_perfect_and_a_collapse_is_not() {
+        let (a, b) = (cycle(100, 0), cycle(100, 9));
+        let turned: Vec<u32> = (0..100).map(|v| (v + 9) % 100).collect();
+        let c = functional(&a.basis(), &b.basis(), &turned, 11, 11);
+        let good = Quality::of_map(&a.mass, &c, 11, &turned);
+        assert!(good.orthogonality < 1e-3 && (good.coverage - 1.0).abs() < 1e-5);
+        let collapsed = vec![5; 100];
+        let c = functional(&a.basis(), &b.basis(), &collapsed, 11, 11);
+        let bad = Quality::of_map(&a.mass, &c, 11, &collapsed);
+        assert!(bad.orthogonality > 0.9 && bad.coverage < 0.011);
+    }
+
+    #[test]
+    fn the_energy_of_coordinates_is_twice_the_area() {
+        let vertices = [
+            [0.0, 0.0, 0.0],
+            [2.0, 0.0, 0.0],
+            [2.0, 1.0, 0.5],
+            [0.0, 1.0, 0.5],
+        ];
+        let faces = [[0, 1, 2], [0, 2, 3]];
+        let area = 2.0 * 1.25f64.sqrt();
+        let energy = dirichlet(&faces, &vertices, |v| vertices[v as usize]);
+        assert!((energy - 2.0 * area).abs() < 1e-5);
+        assert_eq!(dirichlet(&faces, &vertices, |_| [1.0; 3]), 0.0);
+    }
+}

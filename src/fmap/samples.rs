@@ -1,0 +1,201 @@
+//! Farthest-point samples of a shape, each with the mass of its cell, stand for all vertices while a map is small.
+//!
+//! Eldar et al. 1997, *The Farthest Point Strategy for Progressive Image Sampling*. Samples come in order, so the
+//! first half of them are samples too.
+
+use super::basis::Basis;
+use crate::mesh::EdgeGraph;
+use crate::mesh::geodesic::Distances;
+
+/// Vertices that stand for the others.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Samples {
+    /// In the order in which they were chosen.
+    pub vertices: Vec<u32>,
+    /// Mass of the vertices that are nearest to each.
+    pub mass: Vec<f32>,
+    /// Nearest sample of each vertex `(n,)`, as an index into `vertices`.
+    pub nearest: Vec<u32>,
+}
+
+/// The first `count` samples (or all vertices, if there are fewer) for each of the ascending `counts`, by distance
+/// along edges, from the vertex that is farthest from the first one. O(n count) in the worst case, with a small constant.
+pub fn farthest_point_samples(graph: &EdgeGraph, mass: &[f32], counts: &[usize]) -> Vec<Samples> {
+    let n = mass.len();
+    let mut distances = Distances::default();
+    distances.reset(n);
+    let mut nearest = vec![0u32; n];
+    let mut vertices = Vec::new();
+    let mut next = if n > 0 {
+        farthest(&graph.dijkstra(0))
+    } else {
+        0
+    };
+    let mut found = Vec::with_capacity(counts.len());
+    for &count in counts {
+        while vertices.len() < count.min(n) {
+            let number = vertices.len() as u32;
+            vertices.push(next);
+            distances.spread(
+                next,
+                |v| graph.neighbors(v).iter().copied(),
+                |v| nearest[v as usize] = number,
+            );
+            next = farthest(&distances.values);
+        }
+        let mut cell = vec![0.0f32; vertices.len()];
+        for (s, m) in nearest.iter().zip(mass) {
+            cell[*s as usize] += m;
+        }
+        found.push(Samples {
+            vertices: vertices.clone(),
+            mass: cell,
+            nearest: nearest.clone(),
+        });
+    }
+    found
+}
+
+/// The vertex that is farthest, unreached ones before all; the lowest on ties.
+fn farthest(distances: &[f64]) -> u32 {
+    let mut best = (0, f64::NEG_INFINITY);
+    for (v, &d) in distances.iter().enumerate() {
+        if d > best.1 {
+            best = (v, d);
+        }
+    }
+    best.0 as u32
+}
+
+/// A basis at samples, ready for projections: `C = (Φᵀ M Φ)⁻¹ Φᵀ M f` for the first k columns, any k.
+#[derive(Debug, Clone)]
+pub struct SampledBasis {
+    /// Samples.
+    pub n: usize,
+    /// Columns.
+    pub k: usize,
+    /// Eigenvectors at the samples `(n, k)`, row-major.
+    pub rows: Vec<f32>,
+    /// The same times mass.
+    weighted: Vec<f32>,
+    /// Lower Cholesky factor of `Φᵀ M Φ`, row-major `(k, k)`: its leading block is that of the leading block.
+    factor: Vec<f64>,
+}
+
+impl SampledBasis {
+    /// At the given vertices with their masses; fewer columns if there are fewer eigenvectors, or if so few
+    /// samples do not tell them apart.
+    pub fn new(basis: &Basis<'_>, vertices: &[u32], mass: &[f32], k: usize) -> Self {
+        let k = k.min(basis.n_eigenvectors).min(vertices.len()).max(1);
+        let rows = basis.rows(vertices, k);
+        let weighted: Vec<f32> = rows
+            .chunks_exact(k)
+            .zip(mass)
+            .flat_map(|(row, m)| row.iter().map(move |x| x * m))
+            .collect();
+        let gram = super::basis::transposed_product(&rows, &weighted, vertices.len(), k, k);
+        let (factor, sound) = cholesky(&gram, k);
+        let mut this = Self {
+            n: vertices.len(),
+            k,
+            rows,
+            weighted,
+            factor,
+        };
+        if sound < k {
+            this = this.cut(sound.max(1));
+        }
+        this
+    }
+
+    /// The first `k` columns.
+    fn cut(&self, k: usize) -> Self {
+        Self {
+            n: self.n,
+            k,
+            rows: self.leading(k),
+            weighted: columns(&self.weighted, self.k, k),
+            factor: self
+                .factor
+                .chunks_exact(self.k)
+                .take(k)
+                .flat_map(|r| r[..k].iter().copied())
+                .collect(),
+        }
+    }
+
+    /// The first `k` columns `(n, k)`, row-major.
+    pub fn leading(&self, k: usize) -> Vec<f32> {
+        columns(&self.rows, self.k, k)
+    }
+
+    /// Coefficients `(k, dim)` of functions given at the samples `(n, dim)`, by least squares.
+    pub fn fit(&self, values: &[f32], dim: usize, k: usize) -> Vec<f32> {
+        let weighted = columns(&self.weighted, self.k, k);
+        let right = super::basis::transposed_product(&weighted, values, self.n, k, dim);
+        let mut x: Vec<f64> = right.into_iter().map(f64::from).collect();
+        let l = |i: usize, j: usize| self.factor[i * self.k + j];
+        for i in 0..k {
+            for j in 0..i {
+                let (above, row) = x.split_at_mut(i * dim);
+                axpy(&mut row[..dim], -l(i, j), &above[j * dim..(j + 1) * dim]);
+            }
+            scale(&mut x[i * dim..(i + 1) * dim], 1.0 / l(i, i));
+        }
+        for i in (0..k).rev() {
+            for j in i + 1..k {
+                let (row, below) = x.split_at_mut((i + 1) * dim);
+                let from = (j - i - 1) * dim;
+                axpy(&mut row[i * dim..], -l(j, i), &below[from..from + dim]);
+            }
+            scale(&mut x[i * dim..(i + 1) * dim], 1.0 / l(i, i));
+        }
+        x.into_iter().map(|v| v as f32).collect()
+    }
+}
+
+fn axpy(y: &mut [f64], a: f64, x: &[f64]) {
+    for (y, x) in y.iter_mut().zip(x) {
+        *y += a * x;
+    }
+}
+
+fn scale(y: &mut [f64], a: f64) {
+    for y in y {
+        *y *= a;
+    }
+}
+
+/// The first `k` of `stride` columns, row-major.
+pub(super) fn columns(values: &[f32], stride: usize, k: usize) -> Vec<f32> {
+    if k == stride {
+        return values.to_vec();
+    }
+    values
+        .chunks_exact(stride)
+        .flat_map(|row| row[..k].iter().copied())
+        .collect()
+}
+
+/// Lower factor `(k, k)` of a symmetric matrix, row-major, and how many leading rows are positive definite.
+fn cholesky(a: &[f32], k: usize) -> (Vec<f64>, usize) {
+    const LEAST: f64 = 1e-4;
+    let mut l = vec![0.0; k * k];
+    for i in 0..k {
+        for j in 0..=i {
+            let mut sum = f64::from(a[i * k + j]);
+            for c in 0..j {
+                sum -= l[i * k + c] * l[j * k + c];
+            }
+            if i == j {
+                if sum <= LEAST * f64::from(a[i * k + i]) {
+                    return (l, i);
+                }
+                l[i * k + i] = sum.sqrt();
+            } else {
+                l[i * k + j] = sum / l[j * k + j];
+            }
+        }
+    }
+    (l, k)
+}

@@ -1,0 +1,130 @@
+//! Functions and labels on one shape become those on another.
+
+use super::basis::{Basis, product};
+
+/// Values `(n1, dim)` at the vertices of shape 1 become values `(n2, dim)` at those of shape 2, vertex by vertex.
+///
+/// # Panics
+/// If the map names a vertex that does not exist.
+pub fn pulled_back<T: Copy>(p2p_21: &[u32], values: &[T], dim: usize) -> Vec<T> {
+    let mut out = Vec::with_capacity(p2p_21.len() * dim);
+    for &t in p2p_21 {
+        out.extend_from_slice(&values[t as usize * dim..(t as usize + 1) * dim]);
+    }
+    out
+}
+
+/// Values `(n1, dim)` carried as functions: projected onto the first `k1` eigenfunctions, mapped by `c_12 (k2, k1)`,
+/// evaluated `(n2, dim)`. Smooth, and blind to detail that the basis does not hold.
+pub fn carried(
+    one: &Basis<'_>,
+    two: &Basis<'_>,
+    c_12: &[f32],
+    k1: usize,
+    values: &[f32],
+    dim: usize,
+) -> Vec<f32> {
+    let k2 = c_12.len() / k1.max(1);
+    let coefficients = one.project(values, dim, k1);
+    let mapped = product(c_12, &coefficients, k2, k1, dim);
+    product(&two.leading(k2), &mapped, two.n_vertices(), k2, dim)
+}
+
+/// Values at faces `(m1, dim)` of shape 1 become values at faces `(m2, dim)` of shape 2: of each face, the mean over its
+/// corners of the mean over the faces around the matched vertices. Labels and other classes go as indicators.
+pub fn faces_to_faces(
+    faces_1: &[[u32; 3]],
+    faces_2: &[[u32; 3]],
+    n_1: usize,
+    p2p_21: &[u32],
+    values: &[f32],
+    dim: usize,
+) -> Vec<f32> {
+    let mut at_vertices = vec![0.0f32; n_1 * dim];
+    let mut count = vec![0u32; n_1];
+    for (face, row) in faces_1.iter().zip(values.chunks_exact(dim.max(1))) {
+        for v in face {
+            let v = *v as usize;
+            count[v] += 1;
+            for (sum, x) in at_vertices[v * dim..(v + 1) * dim].iter_mut().zip(row) {
+                *sum += x;
+            }
+        }
+    }
+    for (row, n) in at_vertices.chunks_exact_mut(dim.max(1)).zip(&count) {
+        row.iter_mut().for_each(|x| *x /= (*n).max(1) as f32);
+    }
+    let mut out = Vec::with_capacity(faces_2.len() * dim);
+    for face in faces_2 {
+        let corners = face.map(|v| p2p_21[v as usize] as usize * dim);
+        out.extend(
+            (0..dim).map(|c| corners.iter().map(|at| at_vertices[at + c]).sum::<f32>() / 3.0),
+        );
+    }
+    out
+}
+
+/// The label of each face of shape 2 `(m2,)` that most of the faces around the vertices matched to its corners have;
+/// the lowest on ties.
+pub fn labels_to_faces(
+    faces_1: &[[u32; 3]],
+    faces_2: &[[u32; 3]],
+    n_1: usize,
+    p2p_21: &[u32],
+    labels: &[i32],
+) -> Vec<i32> {
+    let mut kinds = labels.to_vec();
+    kinds.sort_unstable();
+    kinds.dedup();
+    let dim = kinds.len();
+    let indicators: Vec<f32> = labels
+        .iter()
+        .flat_map(|l| kinds.iter().map(move |k| f32::from(u8::from(k == l))))
+        .collect();
+    let votes = faces_to_faces(faces_1, faces_2, n_1, p2p_21, &indicators, dim);
+    let most = |row: &[f32]| {
+        let mut best = 0;
+        for (i, x) in row.iter().enumerate() {
+            if *x > row[best] {
+                best = i;
+            }
+        }
+        kinds[best]
+    };
+    votes.chunks_exact(dim.max(1)).map(most).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::convert::functional;
+    use super::super::test_shapes::cycle;
+    use super::{carried, faces_to_faces, labels_to_faces, pulled_back};
+
+    #[test]
+    fn both_ways_carry_a_smooth_function() {
+        let (a, b) = (cycle(120, 0), cycle(120, 40));
+        let p2p: Vec<u32> = (0..120).map(|v| (v + 40) % 120).collect();
+        let c = functional(&a.basis(), &b.basis(), &p2p, 11, 11);
+        let f: Vec<f32> = (0..120).map(|v| a.eigenvectors[v * 11 + 3] - 2.0).collect();
+        let sharp = pulled_back(&p2p, &f, 1);
+        let smooth = carried(&a.basis(), &b.basis(), &c, 11, &f, 1);
+        for v in 0..120 {
+            assert_eq!(sharp[v], f[(v + 40) % 120]);
+            assert!((smooth[v] - sharp[v]).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn faces_take_what_is_around_the_matched_corners() {
+        // A strip of four triangles, mapped onto itself the other way round.
+        let faces = [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]];
+        let p2p = [5, 4, 3, 2, 1, 0];
+        let labels = [7, 7, 2, 2];
+        assert_eq!(
+            labels_to_faces(&faces, &faces, 6, &p2p, &labels),
+            [2, 2, 7, 7]
+        );
+        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[1.0, 1.0, 1.0, 1.0], 1);
+        assert!(carried.iter().all(|x| (x - 1.0).abs() < 1e-6));
+    }
+}

@@ -1,0 +1,173 @@
+//! Maps between the points of two stored shapes, and values carried by them.
+
+use super::{Library, LibraryError, Result};
+use crate::fmap::transfer::{faces_to_faces, labels_to_faces};
+use crate::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
+use crate::pipeline::DescriptionView;
+
+/// What is asked of a map between points.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PointRequest {
+    /// Proxy vertices of the first and of the second shape that correspond.
+    pub landmarks: Vec<[u32; 2]>,
+    /// Which orientation.
+    pub side: Side,
+    /// Rows and columns; 0: 100, or as many as both shapes have.
+    pub k: usize,
+    /// Whether the best map of the other orientation is wanted too.
+    pub alternative: bool,
+}
+
+/// Values at the polygons of a shape.
+#[derive(Debug, Clone, PartialEq)]
+pub enum PolygonValues {
+    /// Labels or other classes `(n_polygons,)`.
+    Labels(Vec<i32>),
+    /// Functions `(n_polygons, dim)`, row-major, and dim.
+    Functions(Vec<f32>, usize),
+}
+
+impl Library {
+    /// The map that carries functions on `from` to `to` point by point, and if wanted the best one of the other
+    /// orientation after it. Nothing is kept.
+    ///
+    /// # Errors
+    /// There is no such shape, or a landmark is no vertex of its proxy.
+    pub fn point_maps(
+        &self,
+        collection: &str,
+        from: &str,
+        to: &str,
+        request: &PointRequest,
+    ) -> Result<Vec<PointMap>> {
+        let a = self.description(collection, from)?;
+        let b = self.description(collection, to)?;
+        maps(&a.view(), &b.view(), request)
+    }
+
+    /// Values at the polygons of `from` become values at those of `to`, by the map between their points: of labels the
+    /// most frequent around the matched points, of functions the mean.
+    ///
+    /// # Errors
+    /// As [`Self::point_maps`]; or there is not one row for each polygon of `from`.
+    pub fn transfer(
+        &self,
+        collection: &str,
+        from: &str,
+        to: &str,
+        values: &PolygonValues,
+        request: &PointRequest,
+    ) -> Result<(PolygonValues, PointMap)> {
+        let a = self.description(collection, from)?;
+        let b = self.description(collection, to)?;
+        let (one, two) = (a.view(), b.view());
+        let n_polygons = one.face_map.len();
+        let rows = match values {
+            PolygonValues::Labels(labels) => labels.len(),
+            PolygonValues::Functions(values, dim) => values.len() / (*dim).max(1),
+        };
+        if rows != n_polygons {
+            let text = format!("values have {rows} rows, but {from:?} has {n_polygons} polygons");
+            return Err(LibraryError::invalid("FIELD_RANGE", text));
+        }
+        let found = maps(&one, &two, request)?.into_iter().next();
+        let map = found.expect("invariant: there is a map between any two shapes");
+        let n = one.vertices.len();
+        let carried = match values {
+            PolygonValues::Labels(labels) => {
+                let of_face = most_frequent(&one, labels);
+                let faces = labels_to_faces(one.faces, two.faces, n, &map.p2p_21, &of_face);
+                let polygons = two.face_map.iter().map(|f| faces[*f as usize]);
+                PolygonValues::Labels(polygons.collect())
+            }
+            PolygonValues::Functions(values, dim) => {
+                let of_face = mean(&one, values, *dim);
+                let faces = faces_to_faces(one.faces, two.faces, n, &map.p2p_21, &of_face, *dim);
+                let polygons = two.face_map.iter();
+                let rows = polygons.flat_map(|f| {
+                    let at = *f as usize * dim;
+                    faces[at..at + dim].iter().copied()
+                });
+                PolygonValues::Functions(rows.collect(), *dim)
+            }
+        };
+        Ok((carried, map))
+    }
+}
+
+fn maps(
+    one: &DescriptionView<'_>,
+    two: &DescriptionView<'_>,
+    request: &PointRequest,
+) -> Result<Vec<PointMap>> {
+    for landmark in &request.landmarks {
+        for (vertex, shape) in landmark.iter().zip([one, two]) {
+            let n = shape.vertices.len();
+            if *vertex as usize >= n {
+                let text = format!("a landmark names vertex {vertex}, but the proxy has {n}");
+                return Err(LibraryError::invalid("FIELD_RANGE", text));
+            }
+        }
+    }
+    let mut options = EstimateOptions {
+        side: request.side,
+        alternative: request.alternative,
+        ..EstimateOptions::default()
+    };
+    if request.k > 0 {
+        for stage in &mut options.stages {
+            stage.k = stage.k.min(request.k);
+        }
+    }
+    let (one, two) = (shape(one, &options), shape(two, &options));
+    Ok(point_maps(&one, &two, &request.landmarks, &options))
+}
+
+fn shape<'a>(d: &DescriptionView<'a>, options: &EstimateOptions) -> PointShape<'a> {
+    let basis = Basis {
+        eigenvalues: d.eigenvalues,
+        eigenvectors: d.eigenvectors,
+        n_eigenvectors: d.n_eigenvectors,
+        mass: d.mass,
+    };
+    PointShape::new(d.vertices, d.faces, basis, options)
+}
+
+/// Area-weighted mean of the polygons of each proxy face `(m, dim)`; 0 where there is none.
+fn mean(d: &DescriptionView<'_>, values: &[f32], dim: usize) -> Vec<f32> {
+    let mut sum = vec![0.0f64; d.faces.len() * dim];
+    let mut area = vec![0.0f64; d.faces.len()];
+    let polygons = d.face_map.iter().zip(d.polygon_area);
+    for ((f, polygon), row) in polygons.zip(values.chunks_exact(dim.max(1))) {
+        let weight = f64::from(*polygon).max(1e-12);
+        area[*f as usize] += weight;
+        for (s, x) in sum[*f as usize * dim..].iter_mut().zip(row) {
+            *s += weight * f64::from(*x);
+        }
+    }
+    let rows = sum.chunks_exact(dim.max(1)).zip(area);
+    rows.flat_map(|(row, area)| row.iter().map(move |s| (s / area.max(1e-300)) as f32))
+        .collect()
+}
+
+/// The label with most area among the polygons of each proxy face `(m,)`; −1 where there is none, the lowest on ties.
+fn most_frequent(d: &DescriptionView<'_>, labels: &[i32]) -> Vec<i32> {
+    let mut kinds = labels.to_vec();
+    kinds.sort_unstable();
+    kinds.dedup();
+    let mut area = vec![0.0f64; d.faces.len() * kinds.len()];
+    for ((f, polygon), label) in d.face_map.iter().zip(d.polygon_area).zip(labels) {
+        let kind = kinds.partition_point(|k| k < label);
+        area[*f as usize * kinds.len() + kind] += f64::from(*polygon).max(1e-12);
+    }
+    let most = |row: &[f64]| {
+        let mut best = (0.0, -1);
+        for (x, kind) in row.iter().zip(&kinds) {
+            if *x > best.0 {
+                best = (*x, *kind);
+            }
+        }
+        best.1
+    };
+    area.chunks_exact(kinds.len().max(1)).map(most).collect()
+}
