@@ -287,18 +287,6 @@ impl Config {
         at_least("limits.max_requests", self.limits.max_requests, 1)?;
         let per_client = self.limits.max_requests_per_client;
         at_least("limits.max_requests_per_client", per_client, 1)?;
-        for (key, found) in [
-            (
-                "limits.max_bytes_per_client",
-                self.limits.max_bytes_per_client,
-            ),
-            ("limits.max_queued_bytes", self.limits.max_queued_bytes),
-        ] {
-            if found < self.limits.max_message {
-                let limit = self.limits.max_message;
-                return refuse(key, format!("{found} is below limits.max_message, {limit}"));
-            }
-        }
         if self.limits.max_queued_seconds == 0 {
             let message = "0 is below the least value, 1".to_owned();
             return refuse("limits.max_queued_seconds", message);
@@ -322,6 +310,18 @@ impl Config {
                 "limits.max_message",
                 format!("{found} is below the least value, 64KiB"),
             );
+        }
+        for (key, found) in [
+            (
+                "limits.max_bytes_per_client",
+                self.limits.max_bytes_per_client,
+            ),
+            ("limits.max_queued_bytes", self.limits.max_queued_bytes),
+        ] {
+            if found < self.limits.max_message {
+                let limit = self.limits.max_message;
+                return refuse(key, format!("{found} is below limits.max_message, {limit}"));
+            }
         }
         if self.work.shape_seconds == 0 {
             return refuse(

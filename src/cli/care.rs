@@ -6,6 +6,11 @@ use std::path::PathBuf;
 
 /// `coseg keys`
 #[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  coseg keys --dir keys generate --server              the daemon's keys
+  coseg keys --dir keys generate laptop --role ingest  a client's
+  coseg keys --dir keys revoke laptop")]
 pub(crate) struct Keys {
     /// Folder of keys [default: security.keys of the configuration, else ~/.config/coseg/keys]
     #[arg(long, value_name = "DIR", global = true)]

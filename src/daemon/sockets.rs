@@ -45,6 +45,8 @@ const POLL_MS: i64 = 500;
 const READ_BATCH: usize = 64;
 /// Milliseconds in which a connection must have said who it is.
 const HANDSHAKE_MS: i32 = 5_000;
+/// How long an address that was just given back is tried at a time.
+const REBIND: Duration = Duration::from_millis(500);
 /// Connections that the kernel keeps until they are taken.
 const BACKLOG: i32 = 1_024;
 /// What a client that finds the queue or the memory full should wait.
@@ -285,6 +287,7 @@ pub(crate) fn serve(
         shared,
         requests,
         limits,
+        must_bind: false,
     };
     std::thread::Builder::new()
         .name("sockets".to_owned())
@@ -296,6 +299,8 @@ struct SocketThread {
     shared: Shared,
     requests: tokio::sync::mpsc::Sender<Incoming>,
     limits: FrameLimits,
+    /// The event socket was unbound and is not bound again yet.
+    must_bind: bool,
 }
 
 impl SocketThread {
@@ -367,13 +372,18 @@ impl SocketThread {
     /// Reads the allow list again. If somebody was taken off it, subscribers must connect again: ZeroMQ has
     /// no way to end one connection. They miss what is published meanwhile, see the gap, and ask for it.
     fn reload(&mut self, always: bool) {
-        if !self.bound.access.reload(always) {
+        if self.bound.access.reload(always) {
+            let uri = self.bound.events.to_string();
+            // This ends its connections. An error means that an earlier attempt has done it.
+            let _ = self.bound.publisher.unbind(&uri);
+            self.must_bind = true;
+        }
+        if !self.must_bind {
             return;
         }
-        let bound = &mut self.bound;
+        let bound = &self.bound;
+        let uri = bound.events.to_string();
         let again = || {
-            let uri = bound.events.to_string();
-            bound.publisher.unbind(&uri)?;
             let new = publisher(&bound.context, &bound.events, &bound.access)?;
             new.bind(&uri)?;
             if let Endpoint::Ipc(path) = &bound.events {
@@ -386,17 +396,18 @@ impl SocketThread {
         let begin = Instant::now();
         let made = loop {
             match again() {
-                Err(zmq::Error::EADDRINUSE | zmq::Error::ENOENT)
-                    if begin.elapsed() < Duration::from_secs(2) =>
-                {
+                Err(zmq::Error::EADDRINUSE) if begin.elapsed() < REBIND => {
                     std::thread::sleep(Duration::from_millis(10));
                 }
                 made => break made,
             }
         };
         match made {
-            Ok(new) => bound.publisher = new,
-            Err(e) => tracing::error!(error = %e, "those who were revoked may go on subscribing"),
+            Ok(new) => {
+                self.bound.publisher = new;
+                self.must_bind = false;
+            }
+            Err(e) => tracing::error!(error = %e, "events cannot be published; trying again"),
         }
     }
 
