@@ -66,15 +66,17 @@ impl Hints {
         guidance: Option<&Guidance<'_>>,
         turn: Option<&Turn<'_>>,
     ) -> Self {
-        let mut parts: Vec<(Vec<f32>, Vec<f32>, usize)> = Vec::new();
+        // Columns at the samples of shape 1 and of shape 2, and how many.
+        let (mut ones, mut twos) = (Vec::new(), Vec::new());
         let scale = |weight: f32| (weight * 2.0 * pair.k as f32).sqrt();
+        let scaled = |x: &[f32], s: f32| -> Vec<f32> { x.iter().map(|v| s * v).collect() };
         if let Some(g) = guidance.filter(|g| g.weight > 0.0) {
             let s = scale(g.weight);
-            let scaled = |x: &[f32]| x.iter().map(|v| s * v).collect();
-            parts.push((scaled(g.one), scaled(g.two), g.dim));
+            ones.push((scaled(g.one, s), g.dim));
+            twos.push((scaled(g.two, s), g.dim));
         }
         if let Some(t) = turn {
-            let (mut x1, mut x2, dim) = t.one.at_samples(
+            let (x1, x2, dim) = t.one.at_samples(
                 t.two,
                 &pair.c_12,
                 pair.k,
@@ -82,26 +84,26 @@ impl Hints {
                 (&two.rows, two.k),
             );
             let s = scale(t.weight);
-            x1.iter_mut().for_each(|v| *v *= s);
-            x2.iter_mut().for_each(|v| *v *= s * t.sign);
-            parts.push((x1, x2, dim));
+            ones.push((scaled(&x1, s), dim));
+            twos.push((scaled(&x2, s * t.sign), dim));
         }
-        let join = |n: usize, side: &dyn Fn(&(Vec<f32>, Vec<f32>, usize)) -> Vec<f32>| {
-            let sides: Vec<(Vec<f32>, usize)> = parts.iter().map(|p| (side(p), p.2)).collect();
-            let mut rows = Vec::new();
-            for v in 0..n {
-                for (x, dim) in &sides {
-                    rows.extend_from_slice(&x[v * dim..(v + 1) * dim]);
-                }
-            }
-            rows
-        };
         Self {
-            one: join(one.n, &|p| p.0.clone()),
-            two: join(two.n, &|p| p.1.clone()),
-            dim: parts.iter().map(|p| p.2).sum(),
+            dim: ones.iter().map(|(_, dim)| dim).sum(),
+            one: side_by_side(&ones, one.n),
+            two: side_by_side(&twos, two.n),
         }
     }
+}
+
+/// Matrices of `n` rows become one, `(n, sum of their columns)`.
+fn side_by_side(parts: &[(Vec<f32>, usize)], n: usize) -> Vec<f32> {
+    let mut rows = Vec::new();
+    for v in 0..n {
+        for (x, dim) in parts {
+            rows.extend_from_slice(&x[v * dim..(v + 1) * dim]);
+        }
+    }
+    rows
 }
 
 impl Pair {
