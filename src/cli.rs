@@ -1,8 +1,12 @@
 //! What was typed becomes one command with typed flags.
 
+mod care;
 mod corrections;
+mod looking;
 
+pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+pub(crate) use looking::{Top, View};
 
 use crate::commands::bench::Bench;
 use crate::commands::demo::DemoArgs;
@@ -55,6 +59,24 @@ pub(crate) struct Global {
         hide_env_values = true
     )]
     pub(crate) endpoint: Option<String>,
+    /// The daemon's public key, if it has keys: server.pub, as `coseg keys generate --server` made it
+    #[arg(
+        long,
+        global = true,
+        env = "COSEG_SERVER_KEY",
+        value_name = "FILE",
+        hide_env_values = true
+    )]
+    pub(crate) server_key: Option<PathBuf>,
+    /// This client's keys, as `coseg keys generate NAME` made them
+    #[arg(
+        long,
+        global = true,
+        env = "COSEG_CLIENT_KEY",
+        value_name = "FILE",
+        hide_env_values = true
+    )]
+    pub(crate) client_key: Option<PathBuf>,
     /// Seconds to wait for an answer; work that goes on is waited for all the same
     #[arg(long, global = true, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
     pub(crate) timeout: Duration,
@@ -63,7 +85,7 @@ pub(crate) struct Global {
     pub(crate) json: bool,
 }
 
-fn seconds(text: &str) -> Result<Duration, String> {
+pub(crate) fn seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text
         .parse()
         .map_err(|_| format!("{text:?} is not a number of seconds"))?;
@@ -92,6 +114,8 @@ pub(crate) enum Command {
     Export(Export),
     /// Draw a collection in the colours of its labels, as one PNG
     Render(Render),
+    /// Write the viewer with a collection as one HTML file, which needs nothing else
+    View(View),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
     /// List the shapes most like one shape
@@ -119,6 +143,8 @@ pub(crate) enum Command {
     Collections(Collections),
     /// Show counters of the daemon
     Stats,
+    /// Follow queue, rates and stages of the daemon, as they change
+    Top(Top),
     /// Let the daemon finish what it is at and stop
     Stop,
     /// Compute the spectrum and descriptors of one mesh, without a daemon
@@ -130,11 +156,35 @@ pub(crate) enum Command {
     /// Measure on meshes with known answers, in temporary libraries
     #[command(subcommand)]
     Bench(Bench),
+    /// List jobs, or the shapes that failed and why
+    Jobs(Jobs),
+    /// Queue the failed shapes of a job again
+    Retry(Retry),
+    /// Make keys, and say who may connect
+    Keys(Keys),
+    /// Describe shapes for a daemon, which starts this by itself
+    #[command(hide = true)]
+    Worker,
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
+    /// Copy a library, also while a daemon uses it, and verify the copy; needs no daemon
+    Snapshot(Snapshot),
+    /// Make a library of a snapshot
+    Restore(Restore),
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
+    /// Print the completions of a shell
+    Completions {
+        /// For which shell
+        shell: clap_complete::Shell,
+    },
+    /// Print the manual page, or write one for each command
+    Man {
+        /// Folder to write all pages to, created if missing
+        #[arg(long, value_name = "DIR")]
+        out: Option<PathBuf>,
+    },
 }
 
 /// `coseg serve`
@@ -145,6 +195,12 @@ pub(crate) struct Serve {
     pub(crate) library: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) file: ConfigFile,
+    /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
+    #[arg(long, value_name = "DIR")]
+    pub(crate) keys: Option<PathBuf>,
+    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
+    #[arg(long, value_name = "HOST:PORT")]
+    pub(crate) http: Option<String>,
     /// Threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
@@ -467,6 +523,9 @@ pub(crate) struct Check {
     /// Folder of the library [default: as `coseg config show` says]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
+    /// Compute anew what is damaged and can be; put the damaged files aside. Not beside a daemon
+    #[arg(long)]
+    pub(crate) repair: bool,
 }
 
 /// `coseg config`

@@ -9,6 +9,7 @@ pub use size::ByteSize;
 use config::{FileFormat, Source, Value, ValueKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 /// The default settings, commented.
@@ -47,12 +48,16 @@ pub enum ConfigError {
 pub struct Config {
     /// Where the daemon listens and keeps things.
     pub server: Server,
+    /// What browsers and monitoring reach.
+    pub http: Http,
     /// How work is done.
     pub work: Work,
     /// What is refused beyond.
     pub limits: Limits,
     /// What may come in.
     pub ingest: Ingest,
+    /// Who may connect.
+    pub security: Security,
     /// What is told to the operator.
     pub log: Log,
 }
@@ -64,6 +69,44 @@ pub struct Server {
     pub endpoint: String,
     /// The folder of the library; empty: the default.
     pub library: PathBuf,
+}
+
+/// What browsers and monitoring reach.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Http {
+    /// HOST:PORT to listen at; empty: nowhere.
+    pub listen: String,
+    /// Whether that may be an address that other machines reach.
+    pub allow_remote: bool,
+    /// Whether the viewer may change labels.
+    pub edit: bool,
+}
+
+impl Http {
+    /// The address to listen at, if there is one; `localhost` is 127.0.0.1.
+    pub fn address(&self) -> Result<Option<SocketAddr>, ConfigError> {
+        if self.listen.is_empty() {
+            return Ok(None);
+        }
+        let refuse = |message: String| ConfigError::Value {
+            key: "http.listen".to_owned(),
+            message,
+        };
+        let numeric = match self.listen.strip_prefix("localhost:") {
+            Some(port) => format!("127.0.0.1:{port}"),
+            None => self.listen.clone(),
+        };
+        let address: SocketAddr = numeric
+            .parse()
+            .map_err(|_| refuse(format!("{:?} is not IP-ADDRESS:PORT", self.listen)))?;
+        if !address.ip().is_loopback() && !self.allow_remote {
+            return Err(refuse(format!(
+                "{address} is not loopback; the endpoint has no authentication, so set http.allow_remote if \
+                 other machines are to reach it"
+            )));
+        }
+        Ok(Some(address))
+    }
 }
 
 /// How work is done.
@@ -90,6 +133,14 @@ pub struct Limits {
     pub max_queued_shapes: usize,
     /// Requests being answered or waiting for it.
     pub max_requests: usize,
+    /// The same, of one client.
+    pub max_requests_per_client: usize,
+    /// Bytes of requests in hand of one client.
+    pub max_bytes_per_client: ByteSize,
+    /// Bytes of the files of accepted shapes that are not placed yet.
+    pub max_queued_bytes: ByteSize,
+    /// Seconds that placing all accepted shapes may take, as estimated.
+    pub max_queued_seconds: u64,
 }
 
 /// What may come in.
@@ -97,6 +148,13 @@ pub struct Limits {
 pub struct Ingest {
     /// Directories below which AddShapes may name files.
     pub paths: Vec<PathBuf>,
+}
+
+/// Who may connect.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Security {
+    /// Folder of keys; empty: none.
+    pub keys: PathBuf,
 }
 
 /// What is told to the operator.
@@ -127,6 +185,10 @@ pub struct Overrides {
     pub endpoint: Option<String>,
     /// `--library`.
     pub library: Option<PathBuf>,
+    /// `--keys`.
+    pub keys: Option<PathBuf>,
+    /// `--http`.
+    pub http: Option<String>,
     /// `--workers`.
     pub workers: Option<usize>,
     /// `--log-level`.
@@ -187,6 +249,12 @@ impl Config {
         if let Some(library) = &overrides.library {
             config.server.library.clone_from(library);
         }
+        if let Some(keys) = &overrides.keys {
+            config.security.keys.clone_from(keys);
+        }
+        if let Some(listen) = &overrides.http {
+            config.http.listen.clone_from(listen);
+        }
         if let Some(workers) = overrides.workers {
             config.work.workers = workers;
         }
@@ -217,6 +285,24 @@ impl Config {
         )?;
         at_least("limits.max_queued_shapes", self.limits.max_queued_shapes, 1)?;
         at_least("limits.max_requests", self.limits.max_requests, 1)?;
+        let per_client = self.limits.max_requests_per_client;
+        at_least("limits.max_requests_per_client", per_client, 1)?;
+        for (key, found) in [
+            (
+                "limits.max_bytes_per_client",
+                self.limits.max_bytes_per_client,
+            ),
+            ("limits.max_queued_bytes", self.limits.max_queued_bytes),
+        ] {
+            if found < self.limits.max_message {
+                let limit = self.limits.max_message;
+                return refuse(key, format!("{found} is below limits.max_message, {limit}"));
+            }
+        }
+        if self.limits.max_queued_seconds == 0 {
+            let message = "0 is below the least value, 1".to_owned();
+            return refuse("limits.max_queued_seconds", message);
+        }
         if self.limits.memory.0 < MIN_MEMORY {
             let (found, limit) = (self.limits.memory, ByteSize(MIN_MEMORY));
             return refuse(
@@ -255,15 +341,21 @@ impl Config {
                 format!("{:?} is not absolute", path.display()),
             );
         }
+        self.http.address()?;
         if !self.server.endpoint.is_empty() {
             crate::ipc::endpoint::Endpoint::parse(&self.server.endpoint)
-                .and_then(|e| e.check_servable())
+                .and_then(|e| e.check_servable(self.has_keys()))
                 .map_err(|e| ConfigError::Value {
                     key: "server.endpoint".to_owned(),
                     message: e.to_string(),
                 })?;
         }
         Ok(())
+    }
+
+    /// Whether every connection is to be encrypted and authenticated.
+    pub fn has_keys(&self) -> bool {
+        !self.security.keys.as_os_str().is_empty()
     }
 
     /// The library's folder: as set, or the default for this user.
@@ -418,6 +510,8 @@ mod tests {
         assert_eq!(config.limits.memory, ByteSize(1 << 30));
         assert_eq!(config.n_workers(), 3);
         assert_eq!(config.log, default.log);
+        let open = load("[http]\nlisten = \"[::]:80\"\nallow_remote = true\n").unwrap();
+        assert!(open.http.address().unwrap().is_some());
     }
 
     #[test]
@@ -454,6 +548,14 @@ mod tests {
             (
                 "[server]\nendpoint = \"udp://127.0.0.1:1\"",
                 "neither ipc://PATH nor tcp://HOST:PORT",
+            ),
+            (
+                "[http]\nlisten = \"0.0.0.0:80\"",
+                "http.listen: 0.0.0.0:80 is not loopback",
+            ),
+            (
+                "[http]\nlisten = \"80\"",
+                "http.listen: \"80\" is not IP-ADDRESS:PORT",
             ),
             ("[log]\nlevel = \"coseg=loud\"", "log.level"),
             ("[log]\nformat = \"xml\"", "format"),

@@ -27,6 +27,7 @@ pub mod store;
 pub mod library;
 pub mod ipc;
 pub mod config;
+pub mod viewer;
 pub mod daemon;
 
 pub use library::Library;

@@ -19,6 +19,9 @@ fn main() -> ExitCode {
         Err(e) => {
             if !e.is_silent() {
                 eprintln!("coseg: {e}");
+                if let Some(advice) = e.advice() {
+                    eprintln!("  {advice}");
+                }
             }
             e.exit_code()
         }

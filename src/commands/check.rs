@@ -1,20 +1,62 @@
-//! `coseg check`: a library's files against its catalog.
+//! `coseg check`, `coseg snapshot` and `coseg restore`: a library's files against its catalog, and copies.
 
-use super::Outcome;
 use super::session::print_line;
-use crate::cli::{Check, Global};
+use super::{CommandError, Outcome};
+use crate::cli::{Check, Global, Restore, Snapshot};
 use coseg::Library;
 use coseg::config::{Config, Overrides};
+use coseg::store::check::Finding;
 use serde_json::json;
+use std::path::{Path, PathBuf};
 
 pub(crate) fn run(args: &Check, global: &Global) -> Outcome {
-    let directory = match &args.library {
+    let directory = library(args.library.as_ref())?;
+    let (findings, repaired) = if args.repair {
+        let repaired = Library::repair(&directory)?;
+        (repaired.left, Some(repaired.done))
+    } else {
+        (Library::check(&directory)?, None)
+    };
+    report(&directory, &findings, repaired.as_deref(), global.json)
+}
+
+/// The folder that was named, or the one of the configuration.
+fn library(named: Option<&PathBuf>) -> Result<PathBuf, CommandError> {
+    Ok(match named {
         Some(directory) => directory.clone(),
         None => Config::load(&Overrides::default())?.library()?,
-    };
-    let findings = Library::check(&directory)?;
+    })
+}
+
+pub(crate) fn snapshot(args: &Snapshot, global: &Global) -> Outcome {
+    let from = library(args.library.as_ref())?;
+    copy(&from, &args.to, args.link, global.json)
+}
+
+pub(crate) fn restore(args: &Restore, global: &Global) -> Outcome {
+    let to = library(args.library.as_ref())?;
+    copy(&args.from, &to, false, global.json)
+}
+
+fn copy(from: &Path, to: &Path, link: bool, as_json: bool) -> Outcome {
+    let copied = Library::copy(from, to, link)?;
+    eprintln!(
+        "{}: {} files, {} bytes",
+        to.display(),
+        copied.n_files,
+        copied.n_bytes
+    );
+    report(to, &copied.findings, None, as_json)
+}
+
+fn report(
+    directory: &Path,
+    findings: &[Finding],
+    repaired: Option<&[String]>,
+    as_json: bool,
+) -> Outcome {
     let n_damaged = findings.iter().filter(|f| f.damage).count();
-    if global.json {
+    if as_json {
         let list = findings
             .iter()
             .map(|f| json!({ "place": f.place, "message": f.message, "damage": f.damage }));
@@ -22,11 +64,15 @@ pub(crate) fn run(args: &Check, global: &Global) -> Outcome {
             "library": directory.display().to_string(),
             "ok": n_damaged == 0,
             "findings": list.collect::<Vec<_>>(),
+            "repaired": repaired,
         });
         print_line(&value.to_string())?;
         return Ok(n_damaged == 0);
     }
-    for f in &findings {
+    for what in repaired.unwrap_or_default() {
+        print_line(&format!("repair: {what}"))?;
+    }
+    for f in findings {
         let kind = if f.damage { "damage" } else { "note" };
         print_line(&format!("{kind}: {}: {}", f.place, f.message))?;
     }

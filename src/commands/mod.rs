@@ -6,6 +6,7 @@ mod bench_labels;
 mod bench_maps;
 mod check;
 mod collections;
+mod completions;
 mod config;
 mod correct;
 pub(crate) mod demo;
@@ -14,9 +15,11 @@ pub(crate) mod describe;
 mod events;
 mod export;
 mod export_mesh;
-mod json;
+mod jobs;
+mod keys;
 mod labels;
 mod ls;
+mod man;
 mod map;
 mod merge;
 mod name;
@@ -30,7 +33,9 @@ mod stats;
 mod stop;
 mod suggest;
 pub(crate) mod synth;
+mod top;
 mod undo;
+mod view;
 mod wait;
 mod watch;
 
@@ -39,6 +44,9 @@ use coseg::config::ConfigError;
 use coseg::daemon::ServeError;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::endpoint::EndpointError;
+use coseg::ipc::json;
+use coseg::ipc::keys::KeyError;
+use coseg::ipc::wire::ErrorReason;
 use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
@@ -49,6 +57,9 @@ pub(crate) enum CommandError {
     /// The daemon did not answer, or refused.
     #[error(transparent)]
     Client(#[from] ClientError),
+    /// Keys cannot be used.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
     /// The configuration is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -97,12 +108,39 @@ impl CommandError {
             | Self::Serve(_)
             | Self::Library(_)
             | Self::Telemetry(_)
+            | Self::Keys(_)
             | Self::Synth(_)
             | Self::Failed(_)
             | Self::File { .. }
             | Self::Output(_) => exit::FAILED,
         };
         ExitCode::from(code)
+    }
+
+    /// What to do next, where that is not plain from the message.
+    pub(crate) fn advice(&self) -> Option<&'static str> {
+        let refusal = match self {
+            Self::Client(ClientError::NoAnswer { .. }) => {
+                return Some("start one with `coseg serve`, or say where it is with --endpoint");
+            }
+            Self::Client(ClientError::Refused(e)) => e,
+            _ => return None,
+        };
+        Some(match refusal.reason() {
+            ErrorReason::NoCollection => "`coseg ls` lists the collections",
+            ErrorReason::NoShape => "`coseg ls --collection NAME` lists the shapes",
+            ErrorReason::NoLabel | ErrorReason::LabelMerged => {
+                "`coseg show --collection NAME` lists the labels"
+            }
+            ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
+            ErrorReason::Draining => "start the daemon again; it takes up what it had accepted",
+            ErrorReason::ReadOnly | ErrorReason::Damaged => {
+                "look at the daemon's log, then run `coseg check`"
+            }
+            ErrorReason::NoSpace => "make room on the disk of the library; nothing was lost",
+            ErrorReason::MeshTooLarge => "`coseg config show` has limits.max_shape",
+            _ => return None,
+        })
     }
 
     /// Whether there is nothing to say about it.
@@ -126,6 +164,8 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
     let done = match &cli.command {
         Command::Serve(args) => serve::run(args, &cli.global),
         Command::Check(args) => check::run(args, &cli.global),
+        Command::Snapshot(args) => check::snapshot(args, &cli.global),
+        Command::Restore(args) => check::restore(args, &cli.global),
         Command::Describe(args) => describe::run(args, &cli.global),
         Command::Config(args) => config::run(args, &cli.global),
         Command::Add(args) => add::run(args, session()?),
@@ -152,7 +192,15 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
             .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
         Command::Bench(args) => bench::run(args, &cli.global),
+        Command::Jobs(args) => jobs::jobs(args, session()?),
+        Command::Retry(args) => jobs::retry(args, session()?),
+        Command::Keys(args) => keys::run(args, &cli.global),
+        Command::Worker => return Ok(coseg::daemon::run_worker()),
+        Command::View(args) => view::run(args, session()?),
         Command::Stats => stats::run(session()?),
+        Command::Top(args) => top::run(args, session()?),
+        Command::Completions { shell } => completions::run(*shell),
+        Command::Man { out } => man::run(out.as_deref()),
         Command::Stop => stop::run(session()?),
     }?;
     Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))

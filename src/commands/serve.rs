@@ -11,6 +11,8 @@ pub(crate) fn run(args: &Serve, global: &Global) -> Outcome {
         file: args.file.config.clone(),
         endpoint: global.endpoint.clone(),
         library: args.library.clone(),
+        keys: args.keys.clone(),
+        http: args.http.clone(),
         workers: args.workers,
         log_level: args.log_level.clone(),
     };

@@ -5,6 +5,7 @@ use crate::cli::{Global, InCollection};
 use coseg::call;
 use coseg::ipc::client::Client;
 use coseg::ipc::endpoint::Endpoint;
+use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
 use coseg::ipc::wire;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::Value;
@@ -27,7 +28,19 @@ impl Session {
             Some(uri) => uri.clone(),
             None => Endpoint::default_for_user().to_string(),
         };
-        let client = Client::connect(&uri, global.timeout)?;
+        let keys = match (&global.server_key, &global.client_key) {
+            (Some(server), Some(own)) => Some(ClientKeys {
+                server: read_public(server)?,
+                own: KeyPair::read(own)?,
+            }),
+            (None, None) => None,
+            _ => {
+                return Err(CommandError::Usage(
+                    "a client needs both keys: --server-key and --client-key".to_owned(),
+                ));
+            }
+        };
+        let client = Client::connect_with(&uri, global.timeout, keys)?;
         Ok(Self {
             client,
             json: global.json,

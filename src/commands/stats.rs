@@ -6,9 +6,12 @@ use coseg::call;
 use coseg::ipc::wire;
 use serde_json::{Value, json};
 
-pub(crate) fn run(mut session: Session) -> Outcome {
-    let s = call!(session.client, Stats(wire::StatsRequest {}))?;
-    let value = json!({
+/// The counters as JSON.
+pub(crate) fn json(s: &wire::StatsReply) -> Value {
+    let stages = s.stages.iter().map(|s| {
+        json!({ "stage": s.stage, "n_shapes": s.n_shapes, "total_ms": s.total_ms, "n_now": s.n_now })
+    });
+    json!({
         "version": s.version,
         "instance": s.instance,
         "pid": s.pid,
@@ -28,12 +31,25 @@ pub(crate) fn run(mut session: Session) -> Outcome {
         "memory_limit_bytes": s.memory_limit_bytes,
         "memory_reserved_bytes": s.memory_reserved_bytes,
         "resident_bytes": s.resident_bytes,
-    });
+        "n_placed": s.n_placed,
+        "n_relabelled": s.n_relabelled,
+        "n_events": s.n_events,
+        "received_bytes": s.received_bytes,
+        "sent_bytes": s.sent_bytes,
+        "stages": stages.collect::<Vec<_>>(),
+    })
+}
+
+pub(crate) fn run(mut session: Session) -> Outcome {
+    let s = call!(session.client, Stats(wire::StatsRequest {}))?;
+    let value = json(&s);
     if session.json {
         session.print_json(&value)?;
         return Ok(true);
     }
+    // `coseg top` shows stages.
     let entries = value.as_object().into_iter().flatten();
+    let entries = entries.filter(|(_, value)| !value.is_array());
     let rows = entries.map(|(key, value)| {
         let text = match value {
             Value::String(text) => text.clone(),

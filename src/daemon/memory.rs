@@ -65,6 +65,10 @@ impl Budget {
         self.freed.notify_one();
     }
 
+    pub(crate) fn limit(&self) -> u64 {
+        self.state().limit
+    }
+
     pub(crate) fn used(&self) -> u64 {
         self.state().used
     }

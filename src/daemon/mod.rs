@@ -5,26 +5,36 @@
 //! [`work`] describes and places accepted shapes; [`publish`] sends what the event log gained.
 //! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
 
+mod access;
+mod fair;
+mod http;
 mod memory;
+mod metrics;
 mod progress;
 mod publish;
+mod quota;
 mod reads;
 mod requests;
 mod service;
 mod sockets;
 mod work;
+mod worker;
 mod writes;
 
 pub use service::{ServeError, serve};
+pub use worker::{POISON_VARIABLE, WORKER_COMMAND, run_worker};
 
 use crate::Library;
 use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
+use crate::ipc::keys::KeyError;
 use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
+use metrics::Metrics;
 use progress::Waiting;
 use publish::Notice;
+use quota::Quotas;
 use sockets::Outbox;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -49,12 +59,23 @@ pub enum StartError {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Endpoint(#[from] EndpointError),
+    #[error(transparent)]
+    Keys(#[from] KeyError),
+    #[error("this binary was built without CURVE; keys cannot be used")]
+    NoCurve,
     #[error("library {path}: {source}")]
     Library { path: String, source: LibraryError },
     #[error("{endpoint}: {source}")]
     Socket {
         endpoint: String,
         source: zmq::Error,
+    },
+    #[error("a worker process cannot be started: {0}")]
+    Worker(std::io::Error),
+    #[error("http.listen {address}: {source}")]
+    Http {
+        address: std::net::SocketAddr,
+        source: std::io::Error,
     },
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
@@ -64,11 +85,15 @@ impl StartError {
     /// Whether the configuration or the command line must be changed.
     pub fn is_configuration(&self) -> bool {
         match self {
-            Self::Config(_) => true,
+            Self::Config(_) | Self::Keys(_) | Self::NoCurve => true,
             Self::Endpoint(e) => {
                 !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
             }
-            Self::Library { .. } | Self::Socket { .. } | Self::Threads(_) => false,
+            Self::Library { .. }
+            | Self::Socket { .. }
+            | Self::Worker(_)
+            | Self::Http { .. }
+            | Self::Threads(_) => false,
         }
     }
 }
@@ -79,6 +104,7 @@ struct Counters {
     requests: AtomicU64,
     refused: AtomicU64,
     failed: AtomicU64,
+    workers_died: AtomicU64,
 }
 
 /// What all tasks of the daemon share.
@@ -90,7 +116,13 @@ struct Daemon {
     instance: String,
     started: Instant,
     counters: Arc<Counters>,
+    metrics: Arc<Metrics>,
+    /// Where the viewer is served, if it is.
+    http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
+    quotas: Arc<Quotas>,
+    /// Whether connections are authenticated.
+    has_keys: bool,
     describe_memory: Arc<Budget>,
     /// A permit for each thread that may describe.
     workers: Arc<Semaphore>,
@@ -101,6 +133,7 @@ struct Daemon {
     outbox: Arc<Outbox>,
     notices: mpsc::UnboundedSender<Notice>,
     work: Work,
+    pool: worker::Pool,
     drain: watch::Sender<bool>,
     /// A client asked for the drain.
     asked_to_drain: std::sync::mpsc::Sender<service::Control>,
@@ -160,7 +193,13 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         uri => Endpoint::parse(uri)?,
     };
     // First the socket: a second daemon should hear of the first, not of its library's lock.
-    let bound = sockets::bind(&endpoint, &config.limits)?;
+    if config.has_keys() && zmq::has("curve") != Some(true) {
+        return Err(StartError::NoCurve);
+    }
+    let access = access::Access::new(&config.security.keys)?;
+    let bound = sockets::bind(&endpoint, &config.limits, access)?;
+    let address = config.http.address()?;
+    let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
     let opened = |source| StartError::Library {
         path: directory.display().to_string(),
@@ -185,7 +224,11 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         instance: instance(),
         started: Instant::now(),
         counters: Arc::default(),
+        metrics: Arc::new(Metrics::new()),
+        http: listener.as_ref().and_then(|l| l.local_addr().ok()),
         request_memory: Budget::new(config.limits.request_bytes()),
+        quotas: Quotas::new(&config.limits),
+        has_keys: config.has_keys(),
         describe_memory: Budget::new(config.limits.describe_bytes()),
         workers: Arc::new(Semaphore::new(n_workers)),
         n_workers,
@@ -194,6 +237,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         outbox: Arc::clone(&bound.outbox),
         notices,
         work: Work::new(),
+        pool: worker::Pool::new(n_workers).map_err(StartError::Worker)?,
         drain: watch::Sender::new(false),
         asked_to_drain,
         config: RwLock::new(Arc::new(config)),
@@ -201,6 +245,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("coseg")
+        .enable_io()
         .enable_time()
         .build()?;
     let socket_tick = Arc::new(AtomicU64::new(0));
@@ -223,10 +268,18 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
     tokio::spawn(sweep(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
+    if let Some(listener) = listener {
+        let listener = tokio::net::TcpListener::from_std(listener)?;
+        let server = http::Server::new(Arc::clone(&daemon), requests_in.clone());
+        tokio::spawn(server.watch(Arc::clone(&socket_tick)));
+        tokio::spawn(http::serve(server, listener));
+    }
     drop(guard);
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
+        quotas: Arc::clone(&daemon.quotas),
         counters: Arc::clone(&daemon.counters),
+        metrics: Arc::clone(&daemon.metrics),
         tick: Arc::clone(&socket_tick),
         max_message_bytes: daemon.config().limits.max_message.0,
     };
@@ -258,11 +311,19 @@ fn instance() -> String {
 async fn sweep(daemon: Arc<Daemon>) {
     loop {
         tokio::time::sleep(SWEEP_EVERY).await;
+        match blocking(&daemon, |d| d.library.forget_old()).await {
+            Ok(Ok((replies, jobs))) => tracing::debug!(replies, jobs, "forgot what is old"),
+            Ok(Err(e)) => tracing::warn!(error = %e, "old replies and jobs cannot be forgotten"),
+            Err(panic) => tracing::error!(panic, "forgetting old replies panicked"),
+        }
         let swept = blocking(&daemon, |d| d.library.store().sweep_orphans(ORPHAN_AGE)).await;
         match swept {
             Ok(Ok(files)) if files.is_empty() => {}
             Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
-            Ok(Err(e)) => tracing::warn!(error = %e, "orphaned files cannot be removed"),
+            Ok(Err(e)) => {
+                daemon.metrics.fault("sweep");
+                tracing::warn!(error = %e, "orphaned files cannot be removed");
+            }
             Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
         }
     }
@@ -288,6 +349,11 @@ impl Running {
         &self.daemon.events
     }
 
+    /// Where the viewer is served, if it is.
+    pub fn http(&self) -> Option<std::net::SocketAddr> {
+        self.daemon.http
+    }
+
     /// Takes over the settings that can change while the daemon runs; the names of the others that differ
     /// are returned.
     pub fn reload(&self, new: &Config) -> Vec<&'static str> {
@@ -304,6 +370,8 @@ impl Running {
         self.daemon
             .request_memory
             .set_limit(config.limits.request_bytes());
+        self.daemon.quotas.set_limits(&config.limits);
+        self.daemon.outbox.reload();
         self.daemon
             .describe_memory
             .set_limit(config.limits.describe_bytes());
@@ -317,6 +385,8 @@ impl Running {
                 "server.library",
                 new.server.library != config.server.library,
             ),
+            ("security.keys", new.security.keys != config.security.keys),
+            ("http", new.http != config.http),
             ("work.workers", new.work.workers != config.work.workers),
             ("limits.max_message", new.limits.max_message != max_message),
             (

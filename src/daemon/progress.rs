@@ -3,7 +3,7 @@
 //! The catalog knows what is durable; the stage a shape is at is not, and lives here.
 
 use crate::library::JobItem;
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use tokio::sync::mpsc;
 
 /// A shape that waits to be described.
@@ -12,6 +12,38 @@ pub(crate) struct Waiting {
     pub(crate) item: JobItem,
     /// Bytes of its file.
     pub(crate) n_bytes: u64,
+}
+
+/// Bytes of a file that take about as long as a shape takes whatever its size.
+const UNIT_BYTES: f64 = (512_u64 << 10) as f64;
+/// Seconds of a unit of work before any was done.
+const FIRST_PACE: f64 = 0.5;
+/// Share of the newest shape in the pace.
+const PACE_WEIGHT: f64 = 0.1;
+
+fn units_of(n_bytes: u64) -> f64 {
+    1.0 + n_bytes as f64 / UNIT_BYTES
+}
+
+/// What is accepted and not placed, with an estimate of the time it takes.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Load {
+    pub(crate) n_shapes: usize,
+    pub(crate) n_bytes: u64,
+    units: f64,
+    pace: f64,
+}
+
+impl Load {
+    /// Seconds until all of it is placed.
+    pub(crate) fn seconds(&self) -> f64 {
+        self.units * self.pace
+    }
+
+    /// Seconds for a shape of `n_bytes` more.
+    pub(crate) fn seconds_of(&self, n_bytes: u64) -> f64 {
+        units_of(n_bytes) * self.pace
+    }
 }
 
 /// A job of which something is left to do.
@@ -36,6 +68,10 @@ pub(crate) struct Progress<S> {
     /// Collections with waiting shapes; the first has the turn.
     turns: VecDeque<String>,
     jobs: HashMap<u64, LiveJob>,
+    /// Bytes of the file of each live shape, by job and index.
+    sizes: HashMap<(u64, u32), u64>,
+    /// Seconds that a unit of work has taken lately.
+    pace: f64,
     /// Jobs are numbered in order of acceptance; this is the last one taken up.
     highest_job: u64,
     /// Counts changes, so that a job taken up again after a restart does not repeat its revisions soon.
@@ -48,6 +84,8 @@ impl<S> Progress<S> {
             lanes: HashMap::new(),
             turns: VecDeque::new(),
             jobs: HashMap::new(),
+            sizes: HashMap::new(),
+            pace: FIRST_PACE,
             highest_job: 0,
             n_changes: 0,
         }
@@ -96,6 +134,8 @@ impl<S> Progress<S> {
         if lane.waiting.is_empty() {
             self.turns.push_back(collection);
         }
+        let place = (job, waiting.item.index);
+        self.sizes.insert(place, waiting.n_bytes);
         lane.waiting.push_back(waiting);
         lane.n_live += 1;
         self.jobs.entry(job).or_default().n_live += 1;
@@ -147,6 +187,7 @@ impl<S> Progress<S> {
 
     /// Nothing of this shape is left to do.
     pub(crate) fn finish(&mut self, item: &JobItem) {
+        self.sizes.remove(&(item.job, item.index));
         if let Some(lane) = self.lanes.get_mut(&item.collection) {
             lane.n_live = lane.n_live.saturating_sub(1);
         }
@@ -180,12 +221,42 @@ impl<S> Progress<S> {
         self.jobs.get(&job)?.stages.get(&index).map(String::as_str)
     }
 
+    /// Notes how long a shape has taken, divided by the number of those that are done side by side.
+    pub(crate) fn note_pace(&mut self, n_bytes: u64, secs: f64) {
+        self.pace += (secs / units_of(n_bytes) - self.pace) * PACE_WEIGHT;
+    }
+
+    /// What is accepted and not placed.
+    pub(crate) fn load(&self) -> Load {
+        Load {
+            n_shapes: self.sizes.len(),
+            n_bytes: self.sizes.values().sum(),
+            units: self.sizes.values().map(|&n| units_of(n)).sum(),
+            pace: self.pace,
+        }
+    }
+
     /// Accepted shapes that are not placed yet, of one collection or of all.
     pub(crate) fn n_live(&self, collection: Option<&str>) -> usize {
         match collection {
             Some(name) => self.lanes.get(name).map_or(0, |l| l.n_live),
             None => self.lanes.values().map(|l| l.n_live).sum(),
         }
+    }
+
+    /// Jobs of which a shape is in work, and jobs that only wait.
+    pub(crate) fn n_jobs(&self) -> (usize, usize) {
+        let working = self.jobs.values().filter(|j| !j.stages.is_empty()).count();
+        (working, self.jobs.len() - working)
+    }
+
+    /// Shapes in work at each stage.
+    pub(crate) fn n_at_stages(&self) -> BTreeMap<String, usize> {
+        let mut counts = BTreeMap::new();
+        for stage in self.jobs.values().flat_map(|j| j.stages.values()) {
+            *counts.entry(stage.clone()).or_default() += 1;
+        }
+        counts
     }
 
     fn touch(&mut self, job: u64) {
@@ -209,6 +280,7 @@ mod tests {
             collection: collection.to_owned(),
             name: format!("{collection}{index}"),
             state: ItemState::Queued,
+            attempts: 0,
         };
         Waiting { item, n_bytes: 1 }
     }
@@ -244,9 +316,15 @@ mod tests {
         let (first, _) = progress.pop().unwrap();
         progress.set_stage(&first.item, "spectrum");
         assert_eq!(progress.stage(7, 0), Some("spectrum"));
+        assert_eq!(progress.n_jobs(), (1, 0));
+        assert_eq!(progress.n_at_stages().get("spectrum"), Some(&1));
         assert!(progress.revision(7).unwrap() > before);
         progress.finish(&first.item);
         assert_eq!((progress.n_live(Some("a")), progress.n_live(None)), (1, 1));
+        assert_eq!((progress.load().n_shapes, progress.load().n_bytes), (1, 1));
+        let before = progress.load().seconds();
+        progress.note_pace(1, 100.0);
+        assert!(progress.load().seconds() > before + 5.0);
         progress.cancel(7);
         assert!(progress.is_cancelled(7));
         progress.drop_waiting(7, |index| index == 1);

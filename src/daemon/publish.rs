@@ -63,6 +63,7 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
         let events = match events {
             Ok(Ok(events)) => events,
             Ok(Err(e)) => {
+                daemon.metrics.fault("publish");
                 tracing::error!(collection, error = %e, "the event log cannot be read");
                 return;
             }
@@ -74,6 +75,7 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
         for event in &events {
             let body = convert::event(&collection, event).encode_to_vec();
             daemon.outbox.event(topic(&collection), body);
+            daemon.metrics.events.inc();
             published.insert(collection.clone(), event.sequence);
         }
         if events.len() < BATCH {

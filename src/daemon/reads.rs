@@ -1,13 +1,15 @@
 //! Requests that change nothing, answered from the library.
 
+use crate::daemon::metrics::Now;
 use crate::daemon::requests::{Answer, MAX_WAIT_MS};
 use crate::daemon::sockets::{MAX_FRAMES, MAX_HEADER_BYTES, MAX_ID_CHARS};
 use crate::daemon::{Daemon, requests};
 use crate::ipc::frames::{FrameReader, FrameWriter};
-use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
-use crate::library::LibraryError;
+use crate::library::{JobFilter, LibraryError};
 use crate::mesh::Format;
+use crate::viewer::{Pack, PortraitError, portrait};
 use bytes::Bytes;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -16,6 +18,8 @@ use std::sync::atomic::Ordering;
 const MAX_PAGE: u32 = 1_000;
 /// Neighbours when the request does not say how many.
 const DEFAULT_NEIGHBORS: u32 = 5;
+/// Shapes of one GetPortraits.
+const MAX_PORTRAITS: usize = 256;
 /// What this version knows beyond the names of its requests.
 const CAPABILITIES: [&str; 6] = [
     "add_shapes.create",
@@ -49,6 +53,7 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
                 job: Some(daemon.job_to_wire(&job)),
             })
         }
+        Body::ListJobs(r) => Reply::ListJobs(list_jobs(daemon, &r)?),
         Body::ListShapes(r) => Reply::ListShapes(list_shapes(daemon, &r)?),
         Body::GetShape(r) => {
             let shape = library.shape(&r.collection, &r.shape).map_err(refuse)?;
@@ -123,6 +128,7 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
                 .map_err(refuse)?;
             Reply::Nearest(convert::nearest(nearest))
         }
+        Body::GetPortraits(r) => Reply::GetPortraits(portraits(daemon, &r, &mut frames)?),
         Body::SuggestNext(r) => {
             let suggestion = library.suggest(&r.collection).map_err(refuse)?;
             Reply::SuggestNext(convert::suggested(&suggestion))
@@ -137,6 +143,7 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
         | Body::Undo(_)
         | Body::AddShapes(_)
         | Body::CancelJob(_)
+        | Body::RetryJob(_)
         | Body::RemoveShape(_)
         | Body::Drain(_)
         | Body::WatchJob(_)
@@ -184,6 +191,25 @@ fn list_shapes(
     Ok(wire::ListShapesReply {
         shapes: shapes.iter().map(convert::shape).collect(),
         next_page_token: last.unwrap_or_default(),
+    })
+}
+
+fn list_jobs(
+    daemon: &Daemon,
+    r: &wire::ListJobsRequest,
+) -> Result<wire::ListJobsReply, wire::Error> {
+    let size = page("page_size", r.page_size, MAX_PAGE)?;
+    let filter = JobFilter {
+        failed: r.failed,
+        before: r.before,
+        collection: Some(r.collection.clone()).filter(|c| !c.is_empty()),
+    };
+    let mut jobs = daemon.library.jobs(&filter, size + 1).map_err(refuse)?;
+    let more = jobs.len() > size;
+    jobs.truncate(size);
+    Ok(wire::ListJobsReply {
+        jobs: jobs.iter().map(|j| daemon.job_to_wire(j)).collect(),
+        more,
     })
 }
 
@@ -253,6 +279,103 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
         memory_reserved_bytes: daemon.request_memory.used() + daemon.describe_memory.used(),
         resident_bytes: resident_bytes(),
         workers: daemon.n_workers as u32,
+        n_placed: daemon.metrics.n_placed(),
+        n_relabelled: daemon.metrics.relabelled.get(),
+        n_events: daemon.metrics.events.get(),
+        received_bytes: daemon.metrics.received_bytes.get(),
+        sent_bytes: daemon.metrics.sent_bytes.get(),
+        stages: daemon.metrics.stages(&daemon.work.progress().n_at_stages()),
+    })
+}
+
+/// All that is measured, as text for Prometheus.
+pub(crate) fn metrics(daemon: &Daemon) -> Result<String, LibraryError> {
+    let library = daemon.library.stats()?;
+    let (n_queued, n_jobs, at_stages) = {
+        let progress = daemon.work.progress();
+        (
+            progress.n_live(None),
+            progress.n_jobs(),
+            progress.n_at_stages(),
+        )
+    };
+    let now = Now {
+        library,
+        n_queued,
+        n_jobs,
+        at_stages,
+        memory_limit: daemon.config().limits.memory.0,
+        memory_reserved: (daemon.request_memory.used(), daemon.describe_memory.used()),
+        resident_bytes: resident_bytes(),
+        workers: daemon.n_workers,
+        uptime_secs: daemon.started.elapsed().as_secs_f64(),
+        requests_in_hand: daemon.max_pending - daemon.pending.available_permits(),
+        ready: not_ready(daemon).is_none(),
+    };
+    Ok(daemon.metrics.text(&now))
+}
+
+/// Why changes are refused; `None` while they are not.
+pub(crate) fn not_ready(daemon: &Daemon) -> Option<String> {
+    if daemon.is_draining() {
+        return Some("draining".to_owned());
+    }
+    let stopped = daemon.library.store().health().read_only();
+    stopped.map(|(since, cause)| format!("the store refuses writes since {since}: {cause}"))
+}
+
+fn undrawable(e: &PortraitError) -> wire::Error {
+    let (code, reason) = match e {
+        PortraitError::TooLarge { .. } => {
+            (ErrorCode::FailedPrecondition, ErrorReason::MeshTooLarge)
+        }
+        PortraitError::Unreadable { .. } => (ErrorCode::DataLoss, ErrorReason::Damaged),
+    };
+    convert::error(code, reason, e.to_string())
+}
+
+/// Shapes in the form that the viewer draws.
+fn portraits(
+    daemon: &Daemon,
+    r: &wire::GetPortraitsRequest,
+    frames: &mut FrameWriter,
+) -> Result<wire::GetPortraitsReply, wire::Error> {
+    let found = r.shapes.len();
+    if found > MAX_PORTRAITS {
+        let text = format!("{found} shapes are asked for, the limit is {MAX_PORTRAITS}");
+        return Err(convert::field_error(
+            ErrorReason::FieldRange,
+            "shapes",
+            text,
+        ));
+    }
+    let library = &daemon.library;
+    let mut pack = Pack::default();
+    let mut shapes = Vec::new();
+    for name in &r.shapes {
+        shapes.push(match r.detail() {
+            wire::PortraitDetail::Unspecified | wire::PortraitDetail::Proxy => {
+                let (mapped, labels, version) = library
+                    .labelled_proxy(&r.collection, name)
+                    .map_err(refuse)?;
+                portrait::proxy(&mut pack, name, version, &mapped.view(), &labels)
+            }
+            wire::PortraitDetail::Functions => {
+                let mapped = library.description(&r.collection, name).map_err(refuse)?;
+                portrait::functions(&mut pack, name, &mapped.view())
+            }
+            wire::PortraitDetail::Surface => {
+                let (bytes, format) = library.original(&r.collection, name).map_err(refuse)?;
+                let labels = library.labels(&r.collection, name, None).map_err(refuse)?;
+                let of = (bytes.as_slice(), format);
+                portrait::surface(&mut pack, name, labels.version, of, &labels.labels)
+                    .map_err(|e| undrawable(&e))?
+            }
+        });
+    }
+    let pack = pack.finish(&serde_json::json!({ "shapes": shapes }));
+    Ok(wire::GetPortraitsReply {
+        pack: Some(frames.file(pack)),
     })
 }
 

@@ -1,23 +1,27 @@
-//! Requests are sorted by what they need: reads run side by side, changes one after the other in order
-//! of arrival, waits hold no thread.
+//! Requests are sorted by what they need: reads run side by side, changes of one collection one after the
+//! other, what is taken in likewise, waits hold no thread. Where requests queue up, clients take turns.
 
+use crate::daemon::fair::{Gate, Turn};
 use crate::daemon::service::Control;
-use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, Peer};
+use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
 use crate::daemon::{Daemon, blocking, reads, writes};
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
 use crate::library::Job;
 use bytes::Bytes;
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
 
 /// Longest wait of WatchJob and WaitIdle, in milliseconds.
 pub(crate) const MAX_WAIT_MS: u64 = 30_000;
 /// WatchJob answers changes no faster than this, so that a client that asks again at once does not read
 /// a job from the catalog a thousand times a second.
 const WATCH_PACE: Duration = Duration::from_millis(50);
+/// Collections whose gates are kept before idle ones are forgotten.
+const MAX_GATES: usize = 1_024;
 /// Reads that run at a time beyond the workers; they mostly wait for the disk.
 const EXTRA_READS: usize = 2;
 
@@ -32,15 +36,15 @@ pub(crate) struct InHand {
 
 /// Sorts requests until the socket thread ends.
 pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<Incoming>) {
-    // Bounded by the permits.
-    let (writes_in, writes_out) = mpsc::unbounded_channel();
-    tokio::spawn(change_in_order(Arc::clone(&daemon), writes_out));
-    let readers = Arc::new(Semaphore::new(daemon.n_workers + EXTRA_READS));
+    // What queues up at the gates is bounded by the permits.
+    let readers = Gate::new(daemon.n_workers + EXTRA_READS);
+    let intake = Gate::new(1);
+    let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
         let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
             let error = busy("too many requests are in hand");
             daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let Some(body) = incoming.request.body.take() else {
@@ -49,25 +53,35 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
                 ErrorReason::UnknownRequest,
                 "the request has no body that this version knows",
             );
-            daemon.answer(incoming.peer, incoming.request.request_id, Err(error));
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
         let in_hand = InHand { incoming, permit };
+        let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
+        // Changes of labels may wait while a lane learns; nothing else waits with them.
+        let gate = changed_collection(&body).map(|name| {
+            if collections.len() >= MAX_GATES {
+                collections.retain(|_, gate| Arc::strong_count(gate) > 1);
+            }
+            let gate = collections.entry(name.to_owned());
+            Arc::clone(gate.or_insert_with(|| Gate::new(1)))
+        });
         match body {
-            Body::CreateCollection(_)
-            | Body::DeleteCollection(_)
+            Body::DeleteCollection(_)
             | Body::NameLabel(_)
             | Body::CorrectLabels(_)
             | Body::MergeLabels(_)
             | Body::SplitLabel(_)
             | Body::Undo(_)
+            | Body::RemoveShape(_)
+            | Body::CreateCollection(_)
             | Body::AddShapes(_)
             | Body::CancelJob(_)
-            | Body::RemoveShape(_)
+            | Body::RetryJob(_)
             | Body::Drain(_) => {
-                // The receiver ends after this sender.
-                let _ = writes_in.send((body, in_hand));
+                let turn = gate.as_ref().unwrap_or(&intake).queue(&client);
+                tokio::spawn(change_in_turn(daemon, body, in_hand, turn));
             }
             Body::WatchJob(request) => {
                 tokio::spawn(in_hand.respond(daemon, async move |d| watch_job(&d, &request).await));
@@ -80,6 +94,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::ListCollections(_)
             | Body::DescribeCollection(_)
             | Body::GetJob(_)
+            | Body::ListJobs(_)
             | Body::ListShapes(_)
             | Body::GetShape(_)
             | Body::GetLabels(_)
@@ -92,14 +107,14 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetPartCorrespondence(_)
             | Body::TransferFunction(_)
             | Body::Nearest(_)
+            | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
-                let readers = Arc::clone(&readers);
+                let turn = readers.queue(&client);
                 let mut in_hand = in_hand;
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
-                    let reader = readers.acquire_owned().await;
-                    let _reader = reader.expect("invariant: the semaphore is never closed");
+                    let _pass = turn.come().await;
                     blocking(&d, move |d| reads::answer(d, body, &frames))
                         .await
                         .unwrap_or_else(panicked)
@@ -109,55 +124,70 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     }
 }
 
-/// Carries out changes in order of arrival.
-async fn change_in_order(
-    daemon: Arc<Daemon>,
-    mut changes: mpsc::UnboundedReceiver<(Body, InHand)>,
-) {
-    while let Some((body, mut in_hand)) = changes.recv().await {
-        if in_hand.is_late() {
-            in_hand.late(&daemon, None);
-            continue;
-        }
-        let key = writes::key(&in_hand.incoming.request);
-        let frames = std::mem::take(&mut in_hand.incoming.frames);
-        // Given back when the change is made: who waits for the placing holds no frames.
-        let memory = in_hand.incoming.memory.take();
-        let done = blocking(&daemon, move |d| {
-            let _memory = memory;
-            let (body, frames) = (body, frames);
-            writes::change(d, &body, &frames, key.as_ref())
-        });
-        let done = done.await;
-        match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-            Ok(writes::Done::Now(result)) => {
-                let drain = matches!(*result, reply::Result::Drain(_));
-                in_hand.finish(&daemon, Ok((*result, Vec::new())));
-                if drain {
-                    // After the reply, which would else come too late for the sockets. An error
-                    // means that the main thread is gone: the daemon is ending already.
-                    let _ = daemon.asked_to_drain.send(Control::Drain);
-                }
+/// The collection whose labels, or existence, a request changes.
+fn changed_collection(body: &Body) -> Option<&str> {
+    Some(match body {
+        Body::DeleteCollection(r) => &r.collection,
+        Body::NameLabel(r) => &r.collection,
+        Body::CorrectLabels(r) => &r.collection,
+        Body::MergeLabels(r) => &r.collection,
+        Body::SplitLabel(r) => &r.collection,
+        Body::Undo(r) => &r.collection,
+        Body::RemoveShape(r) => &r.collection,
+        _ => return None,
+    })
+}
+
+/// Carries out a change when its turn comes.
+async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, turn: Turn) {
+    let Some(pass) = in_hand.by_deadline(turn.come()).await else {
+        return in_hand.late(&daemon, None);
+    };
+    if in_hand.is_late() {
+        return in_hand.late(&daemon, None);
+    }
+    let key = writes::key(&in_hand.incoming.request);
+    let frames = std::mem::take(&mut in_hand.incoming.frames);
+    // Given back when the change is made: who waits for the placing holds no frames.
+    let memory = in_hand.incoming.memory.take();
+    let done = blocking(&daemon, move |d| {
+        let _memory = memory;
+        let (body, frames) = (body, frames);
+        writes::change(d, &body, &frames, key.as_ref())
+    });
+    let done = done.await;
+    drop(pass);
+    in_hand.incoming.ticket.free_bytes();
+    match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
+        Ok(writes::Done::Now(result)) => {
+            let drain = matches!(*result, reply::Result::Drain(_));
+            in_hand.finish(&daemon, Ok((*result, Vec::new())));
+            if drain {
+                // After the reply, which would else come too late for the sockets. An error
+                // means that the main thread is gone: the daemon is ending already.
+                let _ = daemon.asked_to_drain.send(Control::Drain);
             }
-            Ok(writes::Done::WhenPlaced(job)) => {
-                let daemon = Arc::clone(&daemon);
-                tokio::spawn(async move {
-                    let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
-                    match placed {
-                        Some(answer) => in_hand.finish(&daemon, answer),
-                        None => in_hand.late(&daemon, Some(job)),
-                    }
-                });
-            }
-            Err(error) => in_hand.finish(&daemon, Err(error)),
         }
+        Ok(writes::Done::WhenPlaced(job)) => {
+            let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
+            match placed {
+                Some(answer) => in_hand.finish(&daemon, answer),
+                None => in_hand.late(&daemon, Some(job)),
+            }
+        }
+        Err(error) => in_hand.finish(&daemon, Err(error)),
     }
 }
 
 impl InHand {
     /// Sends the reply and gives back the permit.
     fn finish(self, daemon: &Daemon, answer: Answer) {
-        daemon.answer(self.incoming.peer, self.incoming.request.request_id, answer);
+        drop(self.incoming.ticket);
+        daemon.answer(
+            self.incoming.reply_to,
+            self.incoming.request.request_id,
+            answer,
+        );
         drop(self.permit);
     }
 
@@ -208,16 +238,23 @@ impl InHand {
 }
 
 impl Daemon {
-    fn answer(&self, peer: Peer, request_id: String, answer: Answer) {
-        let (result, frames) = match answer {
-            Ok((result, frames)) => (result, frames),
-            Err(error) => {
-                if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
-                    tracing::error!(request_id, message = error.message, "a request failed");
-                }
-                (reply::Result::Error(error), Vec::new())
+    fn answer(&self, reply_to: ReplyTo, request_id: String, answer: Answer) {
+        if let Err(error) = &answer {
+            self.metrics.refused(error);
+            if error.code() == ErrorCode::Internal || error.code() == ErrorCode::DataLoss {
+                tracing::error!(request_id, message = error.message, "a request failed");
+            }
+        }
+        let peer = match reply_to {
+            ReplyTo::Peer(peer) => peer,
+            ReplyTo::Task(task) => {
+                // Whoever asked may have stopped waiting.
+                let _ = task.send(answer);
+                return;
             }
         };
+        let (result, frames) =
+            answer.unwrap_or_else(|error| (reply::Result::Error(error), Vec::new()));
         self.outbox.reply(
             peer,
             Reply {
@@ -253,7 +290,7 @@ impl Daemon {
     }
 }
 
-fn busy(message: &str) -> wire::Error {
+pub(crate) fn busy(message: &str) -> wire::Error {
     let mut error = convert::error(
         ErrorCode::ResourceExhausted,
         ErrorReason::QueueFull,

@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 const DRAIN: Duration = Duration::from_secs(25);
 /// Between looks at the state, when there is no watchdog to be fed sooner.
 const LOOK: Duration = Duration::from_secs(1);
+/// Open files are enough at this many.
+const MAX_FILES: u64 = 65_536;
 /// Exit status after a second SIGTERM or SIGINT, as the shell would report the signal.
 const AT_ONCE: i32 = 143;
 
@@ -43,6 +45,15 @@ pub fn serve(
 ) -> Result<(), ServeError> {
     // Sockets, locks and library files are this user's alone; the sockets' mode is set explicitly.
     rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
+    // Connections are files: as many as the operator's hard limit allows.
+    let files = rustix::process::getrlimit(rustix::process::Resource::Nofile);
+    let raised = rustix::process::Rlimit {
+        current: files.maximum.or(Some(MAX_FILES)).map(|m| m.min(MAX_FILES)),
+        maximum: files.maximum,
+    };
+    if let Err(e) = rustix::process::setrlimit(rustix::process::Resource::Nofile, raised) {
+        tracing::warn!(error = %e, "the number of open files stays as it was");
+    }
     let stopping = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
         // In this order: the first signal arms the second.
@@ -74,6 +85,9 @@ pub fn serve(
         endpoint = %running.endpoint(), events = %running.events(),
         version = env!("CARGO_PKG_VERSION"), "serving"
     );
+    if let Some(address) = running.http() {
+        tracing::info!("viewer and metrics at http://{address}/");
+    }
     notify(&[NotifyState::Ready, NotifyState::Status("serving")]);
     attend(&running, reload);
     tracing::info!("draining");

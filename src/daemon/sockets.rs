@@ -2,7 +2,11 @@
 //! wakes it when there is something to send.
 
 use crate::config::Limits;
+use crate::daemon::access::{Access, ZAP_ENDPOINT};
 use crate::daemon::memory::{Budget, Reservation};
+use crate::daemon::metrics::Metrics;
+use crate::daemon::quota::{Quotas, Ticket};
+use crate::daemon::requests::Answer;
 use crate::daemon::{Counters, StartError};
 use crate::ipc::convert;
 use crate::ipc::endpoint::{Endpoint, claim_socket};
@@ -39,6 +43,10 @@ const LINGER_MS: i32 = 1_000;
 const POLL_MS: i64 = 500;
 /// Requests read before replies get their turn.
 const READ_BATCH: usize = 64;
+/// Milliseconds in which a connection must have said who it is.
+const HANDSHAKE_MS: i32 = 5_000;
+/// Connections that the kernel keeps until they are taken.
+const BACKLOG: i32 = 1_024;
 /// What a client that finds the queue or the memory full should wait.
 pub(crate) const BUSY_RETRY_MS: u64 = 250;
 /// Owner and group may connect; the directory decides who gets that far.
@@ -52,14 +60,24 @@ pub(crate) struct Peer {
     delimiter: bool,
 }
 
+/// Who is waiting for a reply.
+pub(crate) enum ReplyTo {
+    /// A client of the sockets.
+    Peer(Peer),
+    /// A task of this process.
+    Task(tokio::sync::oneshot::Sender<Answer>),
+}
+
 /// A request that arrived.
 pub(crate) struct Incoming {
-    pub(crate) peer: Peer,
+    pub(crate) reply_to: ReplyTo,
     pub(crate) request: Request,
     pub(crate) frames: Vec<Bytes>,
     pub(crate) received: Instant,
     /// Held for as long as the frames are.
     pub(crate) memory: Option<Reservation>,
+    /// Counts it for its client.
+    pub(crate) ticket: Ticket,
 }
 
 enum Outgoing {
@@ -72,6 +90,7 @@ enum Outgoing {
         topic: Vec<u8>,
         body: Vec<u8>,
     },
+    Reload,
     Stop,
 }
 
@@ -94,6 +113,11 @@ impl Outbox {
         self.push(Outgoing::Event { topic, body });
     }
 
+    /// Reads the allow list again.
+    pub(crate) fn reload(&self) {
+        self.push(Outgoing::Reload);
+    }
+
     pub(crate) fn stop(&self) {
         self.push(Outgoing::Stop);
     }
@@ -114,9 +138,13 @@ impl Outbox {
 
 /// Sockets that are bound but not yet served.
 pub(crate) struct Bound {
+    context: zmq::Context,
     router: zmq::Socket,
     publisher: zmq::Socket,
     wake: zmq::Socket,
+    /// Where ZeroMQ asks who may connect.
+    zap: zmq::Socket,
+    access: Access,
     queue: mpsc::Receiver<Outgoing>,
     pub(crate) outbox: Arc<Outbox>,
     pub(crate) endpoint: Endpoint,
@@ -125,8 +153,12 @@ pub(crate) struct Bound {
 }
 
 /// Binds both endpoints.
-pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartError> {
-    endpoint.check_servable()?;
+pub(crate) fn bind(
+    endpoint: &Endpoint,
+    limits: &Limits,
+    access: Access,
+) -> Result<Bound, StartError> {
+    endpoint.check_servable(access.has_keys())?;
     let context = zmq::Context::new();
     let failed = |source| StartError::Socket {
         endpoint: endpoint.to_string(),
@@ -138,25 +170,19 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
         router.set_maxmsgsize(i64::try_from(limits.max_message.0).unwrap_or(i64::MAX))?;
         router.set_rcvhwm(PEER_HWM)?;
         router.set_sndhwm(PEER_HWM)?;
-        let publisher = context.socket(zmq::PUB)?;
-        publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;
-        publisher.set_sndhwm(SUBSCRIBER_HWM)?;
-        for socket in [&router, &publisher] {
-            socket.set_linger(LINGER_MS)?;
-            socket.set_heartbeat_ivl(HEARTBEAT_MS)?;
-            socket.set_heartbeat_timeout(HEARTBEAT_TIMEOUT_MS)?;
-            // Not for an IPv4 address, which would come back as one mapped into IPv6.
-            socket.set_ipv6(
-                matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('[')),
-            )?;
-        }
+        protect(&router, endpoint, &access)?;
+        let publisher = publisher(&context, endpoint, &access)?;
+        // Before any socket is bound, or connections would be let in unasked.
+        let zap = context.socket(zmq::REP)?;
+        zap.set_linger(0)?;
+        zap.bind(ZAP_ENDPOINT)?;
         let (wake, wake_sender) = (context.socket(zmq::PULL)?, context.socket(zmq::PUSH)?);
         wake.bind("inproc://wake")?;
         wake_sender.connect("inproc://wake")?;
         wake_sender.set_linger(0)?;
-        Ok((router, publisher, wake, wake_sender))
+        Ok((router, publisher, wake, wake_sender, zap))
     };
-    let (router, publisher, wake, wake_sender) = sockets().map_err(failed)?;
+    let (router, publisher, wake, wake_sender, zap) = sockets().map_err(failed)?;
     let mut locks = Vec::new();
     let mut listen = |socket: &zmq::Socket, endpoint: &Endpoint| -> Result<Endpoint, StartError> {
         if let Endpoint::Ipc(path) = endpoint {
@@ -193,6 +219,9 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
         wake: Mutex::new(wake_sender),
     });
     Ok(Bound {
+        context,
+        zap,
+        access,
         router,
         publisher,
         wake,
@@ -204,10 +233,37 @@ pub(crate) fn bind(endpoint: &Endpoint, limits: &Limits) -> Result<Bound, StartE
     })
 }
 
+/// What every socket that is bound needs.
+fn protect(socket: &zmq::Socket, endpoint: &Endpoint, access: &Access) -> zmq::Result<()> {
+    socket.set_linger(LINGER_MS)?;
+    socket.set_heartbeat_ivl(HEARTBEAT_MS)?;
+    socket.set_heartbeat_timeout(HEARTBEAT_TIMEOUT_MS)?;
+    socket.set_handshake_ivl(HANDSHAKE_MS)?;
+    socket.set_backlog(BACKLOG)?;
+    // Not for an IPv4 address, which would come back as one mapped into IPv6.
+    let v6 = matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('['));
+    socket.set_ipv6(v6)?;
+    access.protect(socket)
+}
+
+fn publisher(
+    context: &zmq::Context,
+    endpoint: &Endpoint,
+    access: &Access,
+) -> zmq::Result<zmq::Socket> {
+    let publisher = context.socket(zmq::PUB)?;
+    publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;
+    publisher.set_sndhwm(SUBSCRIBER_HWM)?;
+    protect(&publisher, endpoint, access)?;
+    Ok(publisher)
+}
+
 /// What the socket thread shares with the daemon.
 pub(crate) struct Shared {
     pub(crate) memory: Arc<Budget>,
+    pub(crate) quotas: Arc<Quotas>,
     pub(crate) counters: Arc<Counters>,
+    pub(crate) metrics: Arc<Metrics>,
     /// Advances while the thread lives.
     pub(crate) tick: Arc<AtomicU64>,
     pub(crate) max_message_bytes: u64,
@@ -243,12 +299,14 @@ struct SocketThread {
 }
 
 impl SocketThread {
-    fn run(self) {
+    fn run(mut self) {
+        let mut looked = Instant::now();
         loop {
             self.shared.tick.fetch_add(1, Ordering::Relaxed);
             let mut items = [
                 self.bound.router.as_poll_item(zmq::POLLIN),
                 self.bound.wake.as_poll_item(zmq::POLLIN),
+                self.bound.zap.as_poll_item(zmq::POLLIN),
             ];
             match zmq::poll(&mut items, POLL_MS) {
                 Ok(_) | Err(zmq::Error::EINTR) => {}
@@ -257,6 +315,11 @@ impl SocketThread {
                     std::thread::sleep(Duration::from_millis(100));
                 }
             }
+            if looked.elapsed() >= Duration::from_millis(POLL_MS.unsigned_abs()) {
+                looked = Instant::now();
+                self.reload(false);
+            }
+            self.answer_zap();
             while self.bound.wake.recv_msg(zmq::DONTWAIT).is_ok() {}
             while let Ok(outgoing) = self.bound.queue.try_recv() {
                 match outgoing {
@@ -266,13 +329,15 @@ impl SocketThread {
                         frames,
                     } => self.reply(&peer, &reply, frames),
                     Outgoing::Event { topic, body } => self.publish(topic, body),
+                    Outgoing::Reload => self.reload(true),
                     Outgoing::Stop => return,
                 }
             }
             for _ in 0..READ_BATCH {
-                match frames::receive(&self.bound.router, zmq::DONTWAIT, &self.limits, N_LEADING) {
-                    Ok(Ok(message)) => self.request(message),
-                    Ok(Err((leading, e))) => {
+                let router = &self.bound.router;
+                match frames::receive_from(router, zmq::DONTWAIT, &self.limits, N_LEADING) {
+                    Ok((user, Ok(message))) => self.request(user, message),
+                    Ok((_, Err((leading, e)))) => {
                         let Some((peer, header, _)) = split(leading) else {
                             continue;
                         };
@@ -289,10 +354,57 @@ impl SocketThread {
         }
     }
 
-    /// Decodes, admits and hands over a message.
-    fn request(&self, message: Vec<Bytes>) {
+    /// Answers ZeroMQ, which asks for each connection whether it may be.
+    fn answer_zap(&self) {
+        while let Ok(question) = self.bound.zap.recv_multipart(zmq::DONTWAIT) {
+            let answer = self.bound.access.zap(&question);
+            if let Err(e) = self.bound.zap.send_multipart(answer, zmq::DONTWAIT) {
+                tracing::error!(error = %e, "a connection cannot be answered");
+            }
+        }
+    }
+
+    /// Reads the allow list again. If somebody was taken off it, subscribers must connect again: ZeroMQ has
+    /// no way to end one connection. They miss what is published meanwhile, see the gap, and ask for it.
+    fn reload(&mut self, always: bool) {
+        if !self.bound.access.reload(always) {
+            return;
+        }
+        let bound = &mut self.bound;
+        let again = || {
+            let uri = bound.events.to_string();
+            bound.publisher.unbind(&uri)?;
+            let new = publisher(&bound.context, &bound.events, &bound.access)?;
+            new.bind(&uri)?;
+            if let Endpoint::Ipc(path) = &bound.events {
+                std::fs::set_permissions(path, std::fs::Permissions::from_mode(SOCKET_MODE))
+                    .map_err(|_| zmq::Error::EACCES)?;
+            }
+            Ok::<_, zmq::Error>(new)
+        };
+        // The port is free a moment after it is given back.
+        let begin = Instant::now();
+        let made = loop {
+            match again() {
+                Err(zmq::Error::EADDRINUSE | zmq::Error::ENOENT)
+                    if begin.elapsed() < Duration::from_secs(2) =>
+                {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                made => break made,
+            }
+        };
+        match made {
+            Ok(new) => bound.publisher = new,
+            Err(e) => tracing::error!(error = %e, "those who were revoked may go on subscribing"),
+        }
+    }
+
+    /// Decodes, admits and hands over a message. `user` is the sender's key, if there are keys.
+    fn request(&self, user: Option<String>, message: Vec<Bytes>) {
         let received = Instant::now();
         let n_bytes = message.iter().map(|f| f.len() as u64).sum();
+        self.shared.metrics.received_bytes.inc_by(n_bytes);
         let Some((peer, header, frames)) = split(message) else {
             return;
         };
@@ -329,22 +441,48 @@ impl SocketThread {
                 return self.refuse(&peer, String::new(), error);
             }
         }
+        if let Err(error) = self
+            .bound
+            .access
+            .check(user.as_deref(), request.body.as_ref())
+        {
+            self.shared.counters.refused.fetch_add(1, Ordering::Relaxed);
+            return self.refuse(&peer, request.request_id, error);
+        }
+        let most = self
+            .shared
+            .quotas
+            .max_bytes()
+            .min(self.shared.memory.limit());
+        if n_bytes > most {
+            let text = format!("the message has {n_bytes} bytes, the limit is {most}");
+            let error = invalid(ErrorReason::MessageTooLarge, text);
+            return self.refuse(&peer, request.request_id, error);
+        }
+        let client = user.map_or_else(|| peer.identity.clone(), Bytes::from);
+        let ticket = match self.shared.quotas.admit(&client, n_bytes) {
+            Ok(ticket) => ticket,
+            Err(text) => {
+                return self.busy(&peer, request.request_id, ErrorReason::ClientQuota, text);
+            }
+        };
         let Some(memory) = self.shared.memory.try_reserve(n_bytes) else {
             let text = format!("requests in hand leave no memory for {n_bytes} bytes more");
             return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
         };
         let incoming = Incoming {
-            peer,
+            reply_to: ReplyTo::Peer(peer.clone()),
             request,
             frames,
             received,
             memory: Some(memory),
+            ticket,
         };
         if let Err(refused) = self.requests.try_send(incoming) {
             let incoming = refused.into_inner();
             let text = "too many requests wait".to_owned();
             let id = incoming.request.request_id;
-            self.busy(&incoming.peer, id, ErrorReason::QueueFull, text);
+            self.busy(&peer, id, ErrorReason::QueueFull, text);
         }
     }
 
@@ -356,6 +494,7 @@ impl SocketThread {
     }
 
     fn refuse(&self, peer: &Peer, request_id: String, error: wire::Error) {
+        self.shared.metrics.refused(&error);
         let reply = Reply {
             request_id,
             result: Some(reply::Result::Error(error)),
@@ -374,6 +513,11 @@ impl SocketThread {
         }
         parts.push(zmq::Message::from(reply.encode_to_vec()));
         parts.extend(frames.iter().map(|f| zmq::Message::from(&f[..])));
+        let metrics = &self.shared.metrics;
+        metrics.replies.inc();
+        metrics
+            .sent_bytes
+            .inc_by(parts.iter().map(|p| p.len() as u64).sum());
         match frames::send(&self.bound.router, parts, zmq::DONTWAIT) {
             Ok(()) => {}
             Err(zmq::Error::EHOSTUNREACH) => {

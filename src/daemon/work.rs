@@ -8,8 +8,10 @@ use crate::config::Limits;
 use crate::daemon::memory::Reservation;
 use crate::daemon::progress::{Progress, Waiting};
 use crate::daemon::publish::Notice;
+use crate::daemon::worker::Ended;
 use crate::daemon::{Daemon, blocking, panic_text};
 use crate::ipc::convert;
+use crate::library::isolate::DescribeJob;
 use crate::library::{Described, Failure, ItemState, Job, JobItem, LibraryError};
 use crate::pipeline::Description;
 use crate::store::StoreError;
@@ -48,6 +50,8 @@ pub(crate) struct Ready {
     prepared: oneshot::Receiver<(Prepared, Reservation)>,
 }
 
+/// How often the work on a shape may end its worker before it has failed.
+const MAX_ATTEMPTS: u32 = 3;
 /// Delay before a failed write is tried again, doubled each time.
 const FIRST_RETRY: Duration = Duration::from_secs(1);
 const LAST_RETRY: Duration = Duration::from_secs(30);
@@ -215,7 +219,12 @@ async fn hand_out(daemon: &Arc<Daemon>) {
         let daemon = Arc::clone(daemon);
         tokio::task::spawn_blocking(move || {
             let mut memory = memory;
+            let begin = Instant::now();
             let prepared = prepare(&daemon, &waiting.item);
+            if matches!(&prepared, Prepared::Described(d) if d.is_ok()) {
+                let secs = begin.elapsed().as_secs_f64() / daemon.n_workers.max(1) as f64;
+                daemon.work.progress().note_pace(waiting.n_bytes, secs);
+            }
             drop(worker);
             let kept = match &prepared {
                 Prepared::NotNeeded => 0,
@@ -241,24 +250,61 @@ fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
     }
 }
 
-/// Describes one shape; a panic is that shape's failure.
+/// Describes one shape in a worker. What ends the worker is tried again, and is at last that shape's failure;
+/// the attempts are counted durably, so that a restart does not begin anew.
 fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
-    let stage = |name: &str| {
-        daemon.work.progress().set_stage(item, name);
-        daemon.work.changed();
+    let wanted = || {
         !daemon.is_draining()
             && begin.elapsed() < limit
             && !daemon.work.progress().is_cancelled(item.job)
     };
+    let stage = |name: &str| {
+        daemon.work.progress().set_stage(item, name);
+        daemon.work.changed();
+        wanted()
+    };
+    let describer = |job: &DescribeJob<'_>, observed: &dyn Fn(&str) -> bool| {
+        let memory = Limits::to_describe(job.bytes.len() as u64);
+        let observed = |name: &str| {
+            observed(name);
+        };
+        loop {
+            let (text, out_of_memory) = match daemon.pool.describe(job, memory, &observed, &wanted)
+            {
+                Ok(outcome) => return outcome,
+                Err(Ended::Stopped) => return Err(cancelled()),
+                Err(Ended::Died {
+                    text,
+                    out_of_memory,
+                }) => (text, out_of_memory),
+            };
+            let noted = daemon.library.note_attempt(item, &text);
+            let attempts = noted.map_err(|e| convert::library_failure(&e))?;
+            daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(
+                collection = item.collection,
+                shape = item.name,
+                attempts,
+                text,
+                "a worker ended while it described a shape"
+            );
+            if attempts >= MAX_ATTEMPTS {
+                return Err(died(&text, out_of_memory, attempts));
+            }
+            if !wanted() {
+                return Err(cancelled());
+            }
+        }
+    };
     let outcome = catch_unwind(AssertUnwindSafe(|| {
-        daemon.library.describe_item(item, &stage)
+        daemon.library.describe_item_by(item, &stage, &describer)
     }));
     match outcome {
         Ok(Ok(described)) => Ok(described),
         Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
-        Ok(Err(_)) if begin.elapsed() >= limit => {
+        Ok(Err(failure)) if failure.code == "CANCELLED" && begin.elapsed() >= limit => {
             let (found, limit) = (begin.elapsed().as_secs_f64(), limit.as_secs());
             let message = format!("describing it took {found:.0} s, the limit is {limit} s");
             Err(failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message))
@@ -266,6 +312,22 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
         Ok(Err(failure)) => Err(failure),
         Err(panic) => Err(panicked(&panic_text(panic.as_ref()))),
     }
+}
+
+fn died(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
+    let reason = if out_of_memory {
+        "SHAPE_MEMORY"
+    } else {
+        "WORKER_DIED"
+    };
+    let code = if out_of_memory {
+        "RESOURCE_EXHAUSTED"
+    } else {
+        "INTERNAL"
+    };
+    let message =
+        format!("the work on this shape ended its process {attempts} times, the last time: {text}");
+    failed(code, reason, message)
 }
 
 /// Bytes that a description holds until it is placed.
@@ -393,6 +455,7 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
             Ok(Err(LibraryError::Store(
                 e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
             ))) => {
+                daemon.metrics.fault("place");
                 tracing::error!(
                     collection = item.collection, shape = item.name, error = %e,
                     "a shape cannot be stored; trying again in {} s", delay.as_secs()
@@ -429,11 +492,15 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
 fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
     let (collection, shape) = (&item.collection, &item.name);
     match state {
-        ItemState::Done(placed) => tracing::info!(
-            collection, shape, outcome = ?placed.outcome, version = placed.version,
-            ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
-        ),
+        ItemState::Done(placed) => {
+            daemon.metrics.placed(placed);
+            tracing::info!(
+                collection, shape, outcome = ?placed.outcome, version = placed.version,
+                ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
+            );
+        }
         ItemState::Failed(f) => {
+            daemon.metrics.finished("failed");
             daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(
                 collection,
@@ -444,7 +511,10 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
                 "failed"
             );
         }
-        ItemState::Cancelled => tracing::info!(collection, shape, "cancelled"),
+        ItemState::Cancelled => {
+            daemon.metrics.finished("cancelled");
+            tracing::info!(collection, shape, "cancelled");
+        }
         ItemState::Queued | ItemState::Running(_) => {
             tracing::error!(collection, shape, "was placed but is not over");
         }
@@ -462,6 +532,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
         Ok(Ok(again)) => again,
         Ok(Err(LibraryError::NotFound { .. })) => false,
         Ok(Err(e)) => {
+            daemon.metrics.fault("relabel");
             tracing::error!(collection, error = %e, "a stale shape cannot be relabelled");
             false
         }
@@ -471,6 +542,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
         }
     };
     if again {
+        daemon.metrics.relabelled.inc();
         daemon.notice(Notice::Changed(collection.to_owned()));
     }
     daemon.work.changed();

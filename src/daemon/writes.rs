@@ -2,6 +2,7 @@
 
 use crate::config;
 use crate::daemon::Daemon;
+use crate::daemon::progress::Waiting;
 use crate::daemon::publish::Notice;
 use crate::daemon::requests::draining;
 use crate::ipc::convert;
@@ -15,8 +16,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-/// Milliseconds after which a queue of shapes that is full is worth another try.
-const QUEUE_RETRY_MS: u64 = 1_000;
+/// Milliseconds, at least and at most, after which a queue of shapes that is full is worth another try.
+const QUEUE_RETRY_MS: (u64, u64) = (250, 60_000);
 
 /// How a change is answered.
 #[allow(clippy::large_enum_variant)] // returned once, never in a collection
@@ -130,6 +131,20 @@ pub(crate) fn change(
                 job: Some(daemon.job_to_wire(&job)),
             })
         }
+        Body::RetryJob(r) => {
+            let (job, items) = library.retry(r.job_id).map_err(refuse)?;
+            let n_queued = items.len() as u32;
+            let mut waiting = Vec::new();
+            for item in items {
+                let n_bytes = library.item_bytes(&item).map_err(refuse)?;
+                waiting.push(Waiting { item, n_bytes });
+            }
+            daemon.take_up_items(waiting);
+            Reply::RetryJob(wire::RetryJobReply {
+                job: Some(daemon.job_to_wire(&job)),
+                n_queued,
+            })
+        }
         Body::AddShapes(r) => return add_shapes(daemon, r, frames, key),
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
     };
@@ -149,11 +164,11 @@ fn refuse(e: LibraryError) -> wire::Error {
 }
 
 fn drain(daemon: &Daemon) -> Result<Reply, wire::Error> {
-    if let Endpoint::Tcp { .. } = daemon.endpoint {
+    if !daemon.has_keys && matches!(daemon.endpoint, Endpoint::Tcp { .. }) {
         return Err(convert::error(
             ErrorCode::PermissionDenied,
             ErrorReason::AdminIpcOnly,
-            "only a client on an ipc endpoint may drain the daemon",
+            "without keys, only a client on an ipc endpoint may drain the daemon",
         ));
     }
     let n_queued = daemon.work.progress().n_live(None) as u64;
@@ -168,18 +183,6 @@ fn add_shapes(
 ) -> Result<Done, wire::Error> {
     let config = daemon.config();
     let (limits, roots) = (&config.limits, &config.ingest.paths);
-    let n = request.shapes.len();
-    let n_queued = daemon.work.progress().n_live(None);
-    if n <= limits.max_shapes_per_request && n_queued + n > limits.max_queued_shapes {
-        let text = format!(
-            "{n_queued} shapes are queued and {n} more asked for, the limit is {}",
-            limits.max_queued_shapes
-        );
-        let mut error = convert::error(ErrorCode::ResourceExhausted, ErrorReason::QueueFull, text);
-        error.retry_after_ms = QUEUE_RETRY_MS;
-        daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
-        return Err(error);
-    }
     let max_shape_bytes = limits.shape_bytes();
     let read_path = |path: &Path| read_allowed(path, roots, max_shape_bytes);
     let ingest = convert::Ingest {
@@ -188,10 +191,11 @@ fn add_shapes(
         read_path: &read_path,
     };
     let shapes = convert::new_shapes(request, FrameReader::new(frames), &ingest)?;
+    let n_bytes: Vec<u64> = shapes.iter().map(|s| s.bytes.len() as u64).collect();
+    admit(daemon, &n_bytes)?;
     if let Some(create) = &request.create {
         ensure_collection(daemon, &request.collection, create)?;
     }
-    let n_bytes: Vec<u64> = shapes.iter().map(|s| s.bytes.len() as u64).collect();
     let job = daemon
         .library
         .submit(&request.collection, shapes, key)
@@ -204,6 +208,48 @@ fn add_shapes(
             Ok(Done::Now(Box::new(Reply::AddShapes(reply))))
         }
     }
+}
+
+/// Refuses shapes for which the queue has no room: by number, by bytes, and by the time that placing all of
+/// them is estimated to take.
+fn admit(daemon: &Daemon, n_bytes: &[u64]) -> Result<(), wire::Error> {
+    let limits = &daemon.config().limits;
+    let (n, bytes) = (n_bytes.len(), n_bytes.iter().sum::<u64>());
+    let load = daemon.work.progress().load();
+    let secs = n_bytes.iter().map(|&b| load.seconds_of(b)).sum::<f64>();
+    let max_secs = limits.max_queued_seconds as f64;
+    let max_shapes = limits.max_queued_shapes as f64;
+    let max_bytes = limits.max_queued_bytes.0 as f64;
+    for (what, asked, queued, limit) in [
+        ("shapes", n as f64, load.n_shapes as f64, max_shapes),
+        ("bytes", bytes as f64, load.n_bytes as f64, max_bytes),
+        // An estimate alone refuses nothing for good: an empty queue takes whatever it says.
+        (
+            "seconds of work",
+            secs.ceil().min(max_secs),
+            load.seconds().floor(),
+            max_secs,
+        ),
+    ] {
+        if asked > limit {
+            let text = format!("the request has {asked} {what}, the whole queue holds {limit}");
+            let code = ErrorCode::InvalidArgument;
+            return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
+        }
+        if queued + asked > limit {
+            let text = format!(
+                "{queued} {what} are queued and {asked} more asked for, the limit is {limit}"
+            );
+            let code = ErrorCode::ResourceExhausted;
+            let mut error = convert::error(code, ErrorReason::QueueFull, text);
+            // Until as much is done as there is too much of.
+            let wait = load.seconds() * (queued + asked - limit) / queued.max(1.0);
+            error.retry_after_ms = ((wait * 1e3) as u64).clamp(QUEUE_RETRY_MS.0, QUEUE_RETRY_MS.1);
+            daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+            return Err(error);
+        }
+    }
+    Ok(())
 }
 
 /// Creates the collection if it is missing, or compares it with what the request states.

@@ -2,6 +2,7 @@
 
 use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::ipc::frames::{self, FrameLimits};
+use crate::ipc::keys::{ClientKeys, KeyError};
 use crate::ipc::wire::{self, Reply, Request, reply, request};
 use bytes::Bytes;
 use prost::Message as _;
@@ -28,6 +29,8 @@ pub enum ClientError {
     NoAnswer { endpoint: String, timeout: Duration },
     #[error(transparent)]
     Endpoint(#[from] EndpointError),
+    #[error(transparent)]
+    Keys(#[from] KeyError),
     #[error("{}", .0.message)]
     Refused(Box<wire::Error>),
     #[error("the message has {found} {what}, the daemon's limit is {limit}")]
@@ -53,6 +56,7 @@ pub struct Client {
     context: zmq::Context,
     socket: zmq::Socket,
     endpoint: Endpoint,
+    keys: Option<ClientKeys>,
     client_id: String,
     n_requests: u64,
     timeout: Duration,
@@ -62,9 +66,18 @@ pub struct Client {
 impl Client {
     /// Connects to `uri`. That somebody listens there shows with the first request.
     pub fn connect(uri: &str, timeout: Duration) -> Result<Self, ClientError> {
+        Self::connect_with(uri, timeout, None)
+    }
+
+    /// Connects with keys, to a daemon that has them.
+    pub fn connect_with(
+        uri: &str,
+        timeout: Duration,
+        keys: Option<ClientKeys>,
+    ) -> Result<Self, ClientError> {
         let endpoint = Endpoint::parse(uri)?;
         let context = zmq::Context::new();
-        let socket = dealer(&context, &endpoint)?;
+        let socket = dealer(&context, &endpoint, keys.as_ref())?;
         // Unique among all clients of all time: two runs must not share idempotency keys.
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let nanos = since.map_or(0, |d| d.as_nanos());
@@ -73,6 +86,7 @@ impl Client {
             context,
             socket,
             endpoint,
+            keys,
             client_id,
             n_requests: 0,
             timeout,
@@ -118,24 +132,64 @@ impl Client {
         };
         let header = request.encode_to_vec();
         self.check_limits(&header, &frames)?;
-        let deadline = Instant::now() + self.timeout;
-        for attempt in 1..=TRIES {
-            if attempt > 1 {
-                self.socket = dealer(&self.context, &self.endpoint)?;
-            }
-            let until = deadline - self.timeout / TRIES * (TRIES - attempt);
-            if let Some((reply, frames)) = self.exchange(&header, &frames, request_id, until)? {
-                return match reply.result {
-                    Some(reply::Result::Error(e)) => Err(ClientError::Refused(Box::new(e))),
-                    Some(result) => Ok((result, frames)),
-                    None => Err(ClientError::BadReply("it has no result".to_owned())),
-                };
-            }
+        let sent = std::iter::once(&header[..]).chain(frames.iter().map(AsRef::as_ref));
+        let sent: Vec<&[u8]> = sent.collect();
+        let mut until = Instant::now() + self.timeout / TRIES;
+        let mut alive_as = None;
+        let mut answer = self.exchange(&sent, request_id, until)?;
+        while answer.is_none() {
+            // Lost, or still at it? Who answers a Hello on a new connection within the other half of the time is
+            // alive, and a daemon that is alive is waited for: a correction may wait while a lane learns.
+            let Some(instance) = self.instance()? else {
+                return Err(ClientError::NoAnswer {
+                    endpoint: self.endpoint.to_string(),
+                    timeout: self.timeout,
+                });
+            };
+            until = Instant::now() + self.timeout / TRIES;
+            answer = if alive_as.as_ref() == Some(&instance) {
+                self.reply_to(request_id, until)?
+            } else {
+                // The first time, or another daemon than before: the request may be lost. Changes have one effect.
+                self.socket = dealer(&self.context, &self.endpoint, self.keys.as_ref())?;
+                alive_as = Some(instance);
+                self.exchange(&sent, request_id, until)?
+            };
         }
-        Err(ClientError::NoAnswer {
-            endpoint: self.endpoint.to_string(),
+        let (reply, frames) = answer.expect("invariant: the loop ends with an answer");
+        match reply.result {
+            Some(reply::Result::Error(e)) => Err(ClientError::Refused(Box::new(e))),
+            Some(result) => Ok((result, frames)),
+            None => Err(ClientError::BadReply("it has no result".to_owned())),
+        }
+    }
+
+    /// Which daemon answers, asked on a connection of its own; none within half of the timeout.
+    fn instance(&self) -> Result<Option<String>, ClientError> {
+        let request = Request {
+            request_id: "alive".to_owned(),
+            body: Some(request::Body::Hello(wire::HelloRequest {})),
+            ..Request::default()
+        };
+        let other = Self {
+            context: self.context.clone(),
+            socket: dealer(&self.context, &self.endpoint, self.keys.as_ref())?,
+            endpoint: self.endpoint.clone(),
+            keys: None,
+            client_id: String::new(),
+            n_requests: 0,
             timeout: self.timeout,
-        })
+            hello: None,
+        };
+        let until = Instant::now() + self.timeout / TRIES;
+        let header = request.encode_to_vec();
+        let answer = other.exchange(&[&header], &request.request_id, until)?;
+        Ok(answer.and_then(|(reply, _)| match reply.result {
+            Some(reply::Result::Hello(hello)) => Some(hello.instance),
+            // It lives, if it is only to refuse.
+            Some(_) => Some(String::new()),
+            None => None,
+        }))
     }
 
     /// The same, but a daemon that is at a limit is asked again after the delay it names, for as long
@@ -173,7 +227,7 @@ impl Client {
 
     /// A socket that receives the events of `collection`, or of all, and heartbeats.
     pub fn subscribe(&mut self, collection: Option<&str>) -> Result<zmq::Socket, ClientError> {
-        let endpoint = self.hello()?.event_endpoint.clone();
+        let endpoint = self.events()?;
         let socket_error = |source| ClientError::Socket {
             endpoint: endpoint.clone(),
             source,
@@ -181,6 +235,7 @@ impl Client {
         let socket = self.context.socket(zmq::SUB).map_err(socket_error)?;
         let subscribe = || {
             socket.set_linger(LINGER_MS)?;
+            self.keys.as_ref().map_or(Ok(()), |k| k.apply(&socket))?;
             match collection {
                 Some(name) => {
                     socket.set_subscribe(&crate::ipc::topic(name))?;
@@ -192,6 +247,23 @@ impl Client {
         };
         subscribe().map_err(socket_error)?;
         Ok(socket)
+    }
+
+    /// Where events are: on the host that the client knows if the daemon listens on all of its own.
+    fn events(&mut self) -> Result<String, ClientError> {
+        let said = self.hello()?.event_endpoint.clone();
+        match (Endpoint::parse(&said)?, &self.endpoint) {
+            (Endpoint::Tcp { host, port }, Endpoint::Tcp { host: known, .. })
+                if host == "0.0.0.0" || host == "[::]" =>
+            {
+                Ok(Endpoint::Tcp {
+                    host: known.clone(),
+                    port,
+                }
+                .to_string())
+            }
+            _ => Ok(said),
+        }
     }
 
     fn check_limits(&self, header: &[u8], frames: &[Bytes]) -> Result<(), ClientError> {
@@ -219,31 +291,32 @@ impl Client {
     /// are dropped.
     fn exchange(
         &self,
-        header: &[u8],
-        frames: &[Bytes],
+        parts: &[&[u8]],
         request_id: &str,
         until: Instant,
     ) -> Result<Option<(Reply, Vec<Bytes>)>, ClientError> {
-        let socket_error = |source| ClientError::Socket {
-            endpoint: self.endpoint.to_string(),
-            source,
-        };
-        let parts = std::iter::once(header).chain(frames.iter().map(AsRef::as_ref));
-        let left = |until: Instant| {
-            let ms = until.saturating_duration_since(Instant::now()).as_millis();
-            i32::try_from(ms).unwrap_or(i32::MAX)
-        };
+        let socket_error = |source| self.socket_error(source);
         self.socket
-            .set_sndtimeo(left(until))
+            .set_sndtimeo(ms_until(until))
             .map_err(socket_error)?;
-        match frames::send(&self.socket, parts.map(zmq::Message::from).collect(), 0) {
-            Ok(()) => {}
-            Err(zmq::Error::EAGAIN) => return Ok(None),
-            Err(e) => return Err(socket_error(e)),
+        let parts = parts.iter().map(|p| zmq::Message::from(*p)).collect();
+        match frames::send(&self.socket, parts, 0) {
+            Ok(()) => self.reply_to(request_id, until),
+            Err(zmq::Error::EAGAIN) => Ok(None),
+            Err(e) => Err(socket_error(e)),
         }
+    }
+
+    /// Waits for the reply to `request_id` until `until`; replies to earlier requests are dropped.
+    fn reply_to(
+        &self,
+        request_id: &str,
+        until: Instant,
+    ) -> Result<Option<(Reply, Vec<Bytes>)>, ClientError> {
+        let socket_error = |source| self.socket_error(source);
         loop {
             self.socket
-                .set_rcvtimeo(left(until))
+                .set_rcvtimeo(ms_until(until))
                 .map_err(socket_error)?;
             let message = match frames::receive(&self.socket, 0, &REPLY_LIMITS, 1) {
                 Ok(Ok(message)) => message,
@@ -260,14 +333,33 @@ impl Client {
             }
         }
     }
+
+    fn socket_error(&self, source: zmq::Error) -> ClientError {
+        ClientError::Socket {
+            endpoint: self.endpoint.to_string(),
+            source,
+        }
+    }
 }
 
-fn dealer(context: &zmq::Context, endpoint: &Endpoint) -> Result<zmq::Socket, ClientError> {
+fn ms_until(until: Instant) -> i32 {
+    let ms = until.saturating_duration_since(Instant::now()).as_millis();
+    i32::try_from(ms).unwrap_or(i32::MAX)
+}
+
+fn dealer(
+    context: &zmq::Context,
+    endpoint: &Endpoint,
+    keys: Option<&ClientKeys>,
+) -> Result<zmq::Socket, ClientError> {
     let connect = || {
         let socket = context.socket(zmq::DEALER)?;
         socket.set_linger(LINGER_MS)?;
         // Not ZMQ_IMMEDIATE: with it, an answer that has arrived is thrown away if the daemon closes the
         // connection before it is read, as it does after the last answer of a drain.
+        let v6 = matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('['));
+        socket.set_ipv6(v6)?;
+        keys.map_or(Ok(()), |k| k.apply(&socket))?;
         socket.connect(&endpoint.to_string())?;
         Ok(socket)
     };

@@ -26,8 +26,8 @@ pub enum EndpointError {
         limit: usize,
     },
     #[error(
-        "endpoint {uri:?} is not loopback; connections are neither encrypted nor authenticated yet, \
-         so only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
+        "endpoint {uri:?} is not loopback, which needs keys (security.keys, `coseg keys generate`); without \
+         them only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
     )]
     NotLoopback { uri: String },
     #[error("{path}: {message}")]
@@ -168,15 +168,16 @@ impl Endpoint {
         }
     }
 
-    /// Refuses what a daemon must not listen at: anything beyond this machine.
-    pub fn check_servable(&self) -> Result<(), EndpointError> {
+    /// Refuses what a daemon must not listen at: anything beyond this machine, unless every connection is
+    /// encrypted and authenticated.
+    pub fn check_servable(&self, has_keys: bool) -> Result<(), EndpointError> {
         let Self::Tcp { host, .. } = self else {
             return Ok(());
         };
         let bare = host.trim_start_matches('[').trim_end_matches(']');
         let loopback =
             host == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
-        if loopback {
+        if loopback || has_keys {
             Ok(())
         } else {
             Err(EndpointError::NotLoopback {
@@ -338,7 +339,7 @@ mod tests {
         for host in ["127.0.0.1", "127.8.8.8", "localhost", "[::1]"] {
             Endpoint::parse(&format!("tcp://{host}:1"))
                 .unwrap()
-                .check_servable()
+                .check_servable(false)
                 .unwrap();
         }
         for host in [
@@ -353,7 +354,7 @@ mod tests {
             let endpoint = Endpoint::parse(&format!("tcp://{host}:1")).unwrap();
             assert!(
                 matches!(
-                    endpoint.check_servable(),
+                    endpoint.check_servable(false),
                     Err(EndpointError::NotLoopback { .. })
                 ),
                 "{host}"

@@ -107,13 +107,26 @@ pub fn receive(
     limits: &FrameLimits,
     n_kept: usize,
 ) -> Result<Received, zmq::Error> {
+    receive_from(socket, flags, limits, n_kept).map(|(_, received)| received)
+}
+
+/// The same, with who sent it, if the connection is authenticated.
+pub fn receive_from(
+    socket: &zmq::Socket,
+    flags: i32,
+    limits: &FrameLimits,
+    n_kept: usize,
+) -> Result<(Option<String>, Received), zmq::Error> {
+    let mut user = None;
     let mut frames = Vec::new();
     let mut excess = None;
     let (mut n_frames, mut n_bytes) = (0_usize, 0_u64);
     // Routing frames and the header are not raw frames.
     let max_parts = limits.max_frames.saturating_add(n_kept);
     loop {
-        let part = socket.recv_msg(if n_frames == 0 { flags } else { 0 })?;
+        let mut part = socket.recv_msg(if n_frames == 0 { flags } else { 0 })?;
+        // Of the last frame: every one has it but, on some sockets, the routing frame.
+        user = part.gets("User-Id").map(str::to_owned).or(user);
         let more = part.get_more();
         n_frames += 1;
         n_bytes = n_bytes.saturating_add(part.len() as u64);
@@ -135,10 +148,10 @@ pub fn receive(
         }
         if let Some(error) = excess.take_if(|_| !more) {
             frames.truncate(n_kept);
-            return Ok(Err((frames, error)));
+            return Ok((user, Err((frames, error))));
         }
         if !more {
-            return Ok(Ok(frames));
+            return Ok((user, Ok(frames)));
         }
     }
 }

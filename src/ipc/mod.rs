@@ -7,6 +7,8 @@ pub mod client;
 pub mod convert;
 pub mod endpoint;
 pub mod frames;
+pub mod json;
+pub mod keys;
 
 /// The messages of `proto/coseg/v1`, as generated.
 #[allow(missing_docs, unreachable_pub, clippy::all, rustdoc::all)]

@@ -11,6 +11,14 @@ const BAND_EDGES: f64 = 1.5;
 /// Boundary strength of the cut, and the least probability that counts.
 const STRENGTH: f64 = 3.0;
 const FLOOR: f64 = 0.02;
+/// All this holds where an edge of the proxy is at most this many of the surface, plus one. On finer ones
+/// evidence, which grows with area, would outweigh boundaries, which grow with length, until labels follow the
+/// proxy's triangles; so the strength grows along, up to a limit beyond which cuts would take long.
+const TUNED_RATIO: f64 = 3.0;
+const MAX_GAIN: f64 = 2.0;
+/// There the proxy does not say where within a triangle a boundary runs: evidence is full only this far from it,
+/// in mean edge lengths of the proxy.
+const UNSURE_EDGES: f64 = 0.75;
 
 /// Classes of the faces `(m,)` of a full-resolution surface, given for each its proxy face, and the proxy's
 /// classes `(p,)` and probabilities `(p, k)`, 0 to 255. `proxy_edge` is the proxy's mean edge length, in the
@@ -61,18 +69,23 @@ pub fn refine_boundary(
         centroids: Vec::new(),
         edges,
     };
+    let lengths: f64 = surface.edges.iter().map(|e| e.length).sum();
+    let ratio = proxy_edge * surface.edges.len() as f64 / lengths.max(1e-300);
+    let gain = (ratio - TUNED_RATIO).clamp(1.0, MAX_GAIN);
+    let unsure = (gain - 1.0).min(1.0);
     let mut unary = Vec::with_capacity(members.len() * k);
     let mut pinned = Vec::with_capacity(members.len());
     for &f in &members {
         let p = proxy_face[f as usize] as usize;
+        let near = 1.0 - (depth[f as usize] / (UNSURE_EDGES * proxy_edge)).min(1.0);
+        let weight = 1.0 - unsure * near;
         unary.extend((0..k).map(|l| {
-            -(f64::from(probabilities[p * k + l]) / 255.0)
-                .max(FLOOR)
-                .ln()
+            let probability = f64::from(probabilities[p * k + l]) / 255.0;
+            -probability.max(FLOOR).ln() * weight
         }));
         pinned.push((!depth[f as usize].is_finite()).then_some(labels[f as usize]));
     }
-    let refined = cut(&sub, &unary, k, STRENGTH, Some(&pinned));
+    let refined = cut(&sub, &unary, k, gain * STRENGTH, Some(&pinned));
     for (f, l) in members.into_iter().zip(refined) {
         labels[f as usize] = l;
     }
@@ -153,5 +166,57 @@ mod tests {
             Some(20),
             "the crease is outside the band"
         );
+    }
+
+    /// A sheet of `n` by `n` squares, whose proxy has saw teeth of `tooth` squares between two labels.
+    fn saw(n: u32, tooth: u32) -> (Surface, Vec<u32>) {
+        let mut edges = Vec::new();
+        let mut join = |a: u32, b: u32| {
+            edges.push(SurfaceEdge {
+                faces: [a, b],
+                length: 1.0,
+                crease: 0.0,
+                boundary_cost: 1.0,
+            });
+        };
+        let mut proxy_face = Vec::new();
+        for y in 0..n {
+            for x in 0..n {
+                let f = y * n + x;
+                if x + 1 < n {
+                    join(f, f + 1);
+                }
+                if y + 1 < n {
+                    join(f, f + n);
+                }
+                let phase = x % (2 * tooth);
+                let height = phase.min(2 * tooth - phase);
+                proxy_face.push(u32::from(y >= n / 2 - tooth / 2 + height));
+            }
+        }
+        let area = vec![1.0 / f64::from(n * n); (n * n) as usize];
+        let centroids = (0..n * n)
+            .map(|f| [f64::from(f % n), f64::from(f / n), 0.0])
+            .collect();
+        let surface = Surface {
+            area,
+            centroids,
+            edges,
+        };
+        (surface, proxy_face)
+    }
+
+    #[test]
+    fn the_teeth_of_coarse_triangles_do_not_show_on_a_fine_surface() {
+        let (surface, proxy_face) = saw(120, 12);
+        let probabilities = [230, 25, 25, 230];
+        let refined = refine_boundary(&surface, &proxy_face, 12.0, &[0, 1], &probabilities, 2);
+        let length = |labels: &[u32]| {
+            let differ =
+                |e: &&SurfaceEdge| labels[e.faces[0] as usize] != labels[e.faces[1] as usize];
+            surface.edges.iter().filter(differ).count()
+        };
+        assert!(length(&proxy_face) > 220, "{}", length(&proxy_face));
+        assert!(length(&refined) < 150, "{}", length(&refined));
     }
 }

@@ -34,6 +34,8 @@ mod commit;
 mod correct;
 mod error;
 mod history;
+pub mod isolate;
+mod jobs;
 mod lane;
 mod learnt;
 mod merge;
@@ -41,6 +43,7 @@ mod place;
 mod points;
 mod read;
 mod relabel;
+mod repair;
 mod rows;
 mod submit;
 mod suggest;
@@ -50,8 +53,10 @@ mod types;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
+pub use jobs::JobFilter;
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
 pub use points::{PointRequest, PolygonValues};
+pub use repair::Repaired;
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
 pub use types::{
@@ -62,6 +67,7 @@ pub use types::{
 
 use crate::pipeline::Description;
 use crate::store::check::Finding;
+use crate::store::snapshot::Snapshot;
 use crate::store::{CollectionId, CollectionRow, Digest, Store};
 use lane::Lane;
 use std::collections::HashMap;
@@ -80,6 +86,10 @@ pub struct Library {
     max_maps: AtomicU64,
     max_relabelled: AtomicU64,
 }
+
+/// How the work on one shape is done: here, or in another process.
+pub type Describer<'a> =
+    dyn Fn(&isolate::DescribeJob<'_>, &dyn Fn(&str) -> bool) -> isolate::Described + 'a;
 
 /// A description with what the library needs to commit it.
 #[derive(Debug, Clone)]
@@ -113,6 +123,15 @@ impl Library {
     /// There is no library in `dir`, or it is held or unreadable.
     pub fn check(dir: &Path) -> Result<Vec<Finding>> {
         Ok(crate::store::check::check(dir)?)
+    }
+
+    /// Copies the library in `from`, also while it is in use, to `to`, and verifies the copy: a snapshot, or the
+    /// restoring of one.
+    ///
+    /// # Errors
+    /// There is no library in `from`, something in `to`, or the copy cannot be written.
+    pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot> {
+        Ok(crate::store::snapshot::copy(from, to, link)?)
     }
 
     /// The store, for care: its health and the sweep of orphans.

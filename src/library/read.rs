@@ -84,6 +84,25 @@ impl Library {
         Ok(self.known(row.id)?.mapped)
     }
 
+    /// What [`Library::description`] gives, with the newest label of each proxy face (-1: unlabelled) and their
+    /// version, as of one moment.
+    ///
+    /// # Errors
+    /// There is no such shape, or its file is damaged.
+    pub fn labelled_proxy(
+        &self,
+        collection: &str,
+        shape: &str,
+    ) -> Result<(MappedDescription, Vec<i32>, u64)> {
+        let (_, row) = self.shape_row(collection, shape)?;
+        let known = self.known(row.id)?;
+        Ok((
+            known.mapped,
+            known.labels.proxy_labels,
+            known.labels.version,
+        ))
+    }
+
     /// The functional map that carries functions on `from` to `to`: a kept one, or else computed now.
     ///
     /// # Errors

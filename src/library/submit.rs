@@ -1,13 +1,15 @@
 //! Shapes are accepted, described and placed; each request takes effect once.
 
 use super::collections::check_name;
+use super::isolate::DescribeJob;
+use super::jobs::Attempts;
 use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
 use super::{
-    Described, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError, NewShape,
-    Outcome, Placed, RequestKey, Result,
+    Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,
+    NewShape, Outcome, Placed, RequestKey, Result,
 };
 use crate::mesh::{CleanError, ParseError};
-use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, describe};
+use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params};
 use crate::spectrum::SpectrumError;
 use crate::store::{
     CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, RequestRow, ShapeRow, Tx,
@@ -153,8 +155,21 @@ impl Library {
         item: &JobItem,
         stage: &dyn Fn(&str) -> bool,
     ) -> std::result::Result<Described, Failure> {
+        self.describe_item_by(item, stage, &|job, stage| job.run(stage))
+    }
+
+    /// The same, done by `describer`, perhaps in another process.
+    ///
+    /// # Errors
+    /// Why the shape is refused, or why it was stopped.
+    pub fn describe_item_by(
+        &self,
+        item: &JobItem,
+        stage: &dyn Fn(&str) -> bool,
+        describer: &Describer<'_>,
+    ) -> std::result::Result<Described, Failure> {
         let key = (item.job, item.index);
-        let described = self.describe_bytes(item, stage);
+        let described = self.describe_bytes(item, stage, describer);
         self.running
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -166,6 +181,7 @@ impl Library {
         &self,
         item: &JobItem,
         stage: &dyn Fn(&str) -> bool,
+        describer: &Describer<'_>,
     ) -> std::result::Result<Described, Failure> {
         let row = self.item_row(item).map_err(|e| failure(&e))?;
         let collection = self
@@ -196,7 +212,12 @@ impl Library {
             laps.borrow_mut().0.push((name.to_string(), 0.0));
             stage(name)
         };
-        let description = describe(&bytes, format, &params, &observed).map_err(|e| refusal(&e))?;
+        let work = DescribeJob {
+            bytes: &bytes,
+            format,
+            params,
+        };
+        let description = describer(&work, &observed)?;
         lap();
         let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm());
         let stages_ms = laps.into_inner().0;
@@ -340,7 +361,7 @@ impl Library {
         })
     }
 
-    fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
+    pub(super) fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
         let rows = self
             .store
             .catalog()
@@ -352,12 +373,16 @@ impl Library {
         })
     }
 
-    fn item(&self, row: JobItemRow) -> Result<JobItem> {
+    pub(super) fn item(&self, row: JobItemRow) -> Result<JobItem> {
         let place = format!("job_items {}, {}", row.job, row.index);
         let detail = || {
             row.detail_json
                 .as_deref()
                 .ok_or_else(|| damaged(&place, "no detail"))
+        };
+        let attempts = match (row.status, &row.detail_json) {
+            (ItemStatus::Queued, Some(detail)) => from_json::<Attempts>(detail, &place)?.attempts,
+            _ => 0,
         };
         let state = match row.status {
             ItemStatus::Queued => {
@@ -375,6 +400,7 @@ impl Library {
             collection: row.collection,
             name: row.item.name,
             state,
+            attempts,
         })
     }
 }
@@ -387,12 +413,12 @@ fn unix_secs() -> u64 {
 
 /// What decides the bits of a description besides bytes and parameters: the algorithm, and the instruction set that
 /// the kernels choose at run time.
-fn algorithm() -> String {
+pub(super) fn algorithm() -> String {
     format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new())
 }
 
 /// The parameters of a collection's descriptions, and the text that names them.
-fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
+pub(super) fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
     let operator = operator_from_name(&row.operator, &format!("collections {}", row.name))?;
     let params = Params {
         operator,
@@ -441,7 +467,7 @@ fn failure(error: &LibraryError) -> Failure {
 }
 
 /// Why a mesh could not be described, as the failure of an item.
-fn refusal(error: &DescribeError) -> Failure {
+pub(super) fn refusal(error: &DescribeError) -> Failure {
     let (code, reason) = match error {
         DescribeError::Parse(e) => ("INVALID_ARGUMENT", parse_reason(e)),
         DescribeError::Clean(CleanError::AllDegenerate { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),

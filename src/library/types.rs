@@ -249,6 +249,8 @@ pub struct JobItem {
     pub name: String,
     /// What became of it.
     pub state: ItemState,
+    /// How often the work on it ended its process so far, while it is queued.
+    pub attempts: u32,
 }
 
 /// Shapes that were accepted together.

@@ -69,8 +69,7 @@ impl Network {
         let (s, t) = (self.source(), self.sink());
         let mut level = vec![NONE; self.n + 2];
         while self.levels(&mut level) {
-            let mut arc = self.first.clone();
-            while self.augment(s, t, &level, &mut arc) > 0 {}
+            self.block(s, t, &level);
         }
         (0..self.n).map(|v| level[v] == NONE).collect()
     }
@@ -94,14 +93,30 @@ impl Network {
         level[self.sink()] != NONE
     }
 
-    /// Sends flow along one path of the level graph, without recursion; the amount, 0 if none is left.
-    fn augment(&mut self, s: usize, t: usize, level: &[u32], arc: &mut [u32]) -> i64 {
+    /// Sends flow along paths of the level graph until none is left, without recursion. After a path is
+    /// used, the search goes on from where it first became full.
+    fn block(&mut self, s: usize, t: usize, level: &[u32]) {
+        let mut arc = self.first.clone();
         let mut path: Vec<u32> = Vec::new();
         let mut v = s;
-        while v != t {
+        loop {
+            if v == t {
+                let residual = &self.residual;
+                let flow = path.iter().map(|a| residual[*a as usize]).min();
+                let flow = flow.expect("invariant: source and sink differ");
+                for &a in &path {
+                    self.residual[a as usize] -= flow;
+                    self.residual[a as usize ^ 1] += flow;
+                }
+                let full = path.iter().position(|a| self.residual[*a as usize] == 0);
+                let full = full.expect("invariant: the least residual is used up");
+                v = self.head[path[full] as usize ^ 1] as usize;
+                path.truncate(full);
+                continue;
+            }
             let a = arc[v];
             if a == NONE {
-                let Some(back) = path.pop() else { return 0 };
+                let Some(back) = path.pop() else { return };
                 v = self.head[back as usize ^ 1] as usize;
                 arc[v] = self.next[arc[v] as usize];
                 continue;
@@ -114,16 +129,6 @@ impl Network {
                 arc[v] = self.next[a as usize];
             }
         }
-        let flow = path
-            .iter()
-            .map(|a| self.residual[*a as usize])
-            .min()
-            .unwrap_or(0);
-        for a in path {
-            self.residual[a as usize] -= flow;
-            self.residual[a as usize ^ 1] += flow;
-        }
-        flow
     }
 }
 

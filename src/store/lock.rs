@@ -5,19 +5,32 @@ use rustix::fs::{FlockOperation, flock};
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 /// The file that is locked, in the library's folder.
 pub const LOCK_FILE: &str = "lock";
+
+/// A process that was killed may have left a child between fork and exec, which shares its open files
+/// for a moment.
+const PATIENCE: Duration = Duration::from_millis(300);
 
 /// An exclusive lock on a library folder. The kernel releases it when the process ends, however it
 /// ends, so a lock left behind by a crash does not exist.
 #[derive(Debug)]
 pub struct LibraryLock {
-    _file: File,
+    file: File,
+}
+
+impl Drop for LibraryLock {
+    fn drop(&mut self) {
+        // Closing is not enough: the lock belongs to the open file, which a child that some other thread
+        // has forked shares until it has become another program.
+        let _ = flock(&self.file, FlockOperation::Unlock);
+    }
 }
 
 impl LibraryLock {
-    /// Takes the lock without waiting. The lock file names the holder's process id for people; it
+    /// Takes the lock, or says within a third of a second that it is held. The lock file names the holder's process id for people; it
     /// is never removed, since removing it would let two processes lock two different files.
     pub fn acquire(dir: &Path) -> Result<Self, StoreError> {
         let path = dir.join(LOCK_FILE);
@@ -28,18 +41,24 @@ impl LibraryLock {
             .truncate(false)
             .open(&path)
             .map_err(|e| StoreError::io(&path, e))?;
-        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => {}
-            Err(rustix::io::Errno::WOULDBLOCK) => {
-                return Err(StoreError::Locked {
-                    path: dir.display().to_string(),
-                });
+        let begin = Instant::now();
+        loop {
+            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => break,
+                Err(rustix::io::Errno::WOULDBLOCK) if begin.elapsed() < PATIENCE => {
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                Err(rustix::io::Errno::WOULDBLOCK) => {
+                    return Err(StoreError::Locked {
+                        path: dir.display().to_string(),
+                    });
+                }
+                Err(errno) => return Err(StoreError::io(&path, errno.into())),
             }
-            Err(errno) => return Err(StoreError::io(&path, errno.into())),
         }
         file.set_len(0)
             .and_then(|()| writeln!(file, "{}", std::process::id()))
             .map_err(|e| StoreError::io(&path, e))?;
-        Ok(Self { _file: file })
+        Ok(Self { file })
     }
 }

@@ -30,7 +30,9 @@ mod health;
 pub mod lock;
 pub mod mapped;
 pub mod objects;
+pub mod quarantine;
 pub mod rows;
+pub mod snapshot;
 
 pub use array_file::write_description;
 pub use catalog::{Catalog, Reader, Tx};

@@ -41,6 +41,10 @@ fn help_tells_the_commands_and_the_exit_codes() {
         "name",
         "collections",
         "stats",
+        "top",
+        "view",
+        "completions",
+        "man",
         "stop",
         "check",
         "config",
@@ -87,7 +91,8 @@ fn no_daemon_exits_3_in_time_and_says_so() {
     assert_eq!(output.status.code(), Some(3));
     let said = stderr(&output);
     let expected = format!(
-        "coseg: no answer from {} within 0.3 s; is a daemon running there?\n",
+        "coseg: no answer from {} within 0.3 s; is a daemon running there?\n  \
+         start one with `coseg serve`, or say where it is with --endpoint\n",
         home.endpoint()
     );
     assert_eq!(said, expected);
@@ -336,7 +341,10 @@ fn shapes_are_compared_named_and_removed() {
     let gone = home.coseg(&["labels", "9"]);
     assert_eq!(
         (gone.status.code(), stderr(&gone).as_str()),
-        (Some(1), "coseg: no shape named \"9\"\n")
+        (
+            Some(1),
+            "coseg: no shape named \"9\"\n  `coseg ls --collection NAME` lists the shapes\n"
+        )
     );
     let gone = home.coseg(&["rm", "9", "10", "--json"]);
     let removed = json(&gone, 1);

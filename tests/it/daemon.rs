@@ -2,9 +2,13 @@
 
 mod adding;
 mod correcting;
+mod isolation;
 mod life;
+mod overload;
+mod repeats;
+mod security;
 
-use crate::harness::{DEADLINE, Home, add, add_request, refusal, skittle};
+use crate::harness::{DEADLINE, Home, add, add_request, refusal, skittle, wait_idle};
 use coseg::call;
 use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::wire::{
@@ -31,8 +35,13 @@ fn raw_error(socket: &zmq::Socket, frames: &[&[u8]]) -> wire::Error {
 }
 
 fn create(client: &mut Client, name: &str) -> wire::Collection {
+    create_with(client, name, 0)
+}
+
+fn create_with(client: &mut Client, name: &str, n_parts: u32) -> wire::Collection {
     let spec = wire::CollectionSpec {
         name: name.to_owned(),
+        n_parts: Some(n_parts),
         ..Default::default()
     };
     let request = wire::CreateCollectionRequest { spec: Some(spec) };
@@ -43,20 +52,16 @@ fn create(client: &mut Client, name: &str) -> wire::Collection {
 }
 
 fn events_since(client: &mut Client, collection: &str) -> Vec<wire::Event> {
+    events_after(client, collection, 0)
+}
+
+fn events_after(client: &mut Client, collection: &str, sequence: u64) -> Vec<wire::Event> {
     let request = wire::EventsSinceRequest {
         collection: collection.to_owned(),
-        sequence: 0,
+        sequence,
         limit: 0,
     };
     call!(client, EventsSince(request)).unwrap().events
-}
-
-fn wait_idle(client: &mut Client, collection: &str) {
-    let request = wire::WaitIdleRequest {
-        collection: collection.to_owned(),
-        wait_ms: 30_000,
-    };
-    while !call!(client, WaitIdle(request.clone())).unwrap().idle {}
 }
 
 /// Adds without settings of the collection.

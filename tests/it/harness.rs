@@ -286,6 +286,31 @@ pub(crate) fn skittle(variant: u32) -> String {
 /// Faces of a [`skittle`].
 pub(crate) const SKITTLE_FACES: usize = 2 * 16 * 23;
 
+/// Waits until a collection has nothing left to do.
+pub(crate) fn wait_idle(client: &mut Client, collection: &str) {
+    let request = wire::WaitIdleRequest {
+        collection: collection.to_owned(),
+        wait_ms: 30_000,
+    };
+    while !coseg::call!(client, WaitIdle(request.clone()))
+        .unwrap()
+        .idle
+    {}
+}
+
+/// A number from the environment, for longer runs of a test.
+pub(crate) fn number(variable: &str, default: u64) -> u64 {
+    std::env::var(variable).map_or(default, |text| {
+        let read = text.parse();
+        read.unwrap_or_else(|_| panic!("{variable} is {text:?}, which is no number"))
+    })
+}
+
+/// The seed of random tests: always the same, unless the environment names another.
+pub(crate) fn seed() -> u64 {
+    number("COSEG_TEST_SEED", 1)
+}
+
 /// Standard output as text; the command must have ended with `code`.
 pub(crate) fn stdout(output: &Output, code: i32) -> String {
     let stderr = String::from_utf8_lossy(&output.stderr);

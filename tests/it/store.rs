@@ -5,6 +5,7 @@ mod catalog;
 mod crash;
 mod damage;
 mod jobs;
+mod model;
 mod readers;
 
 use coseg::mesh::CleanReport;

@@ -3,6 +3,7 @@
 import pytest
 
 from coseg._link import PING_S, RESEND_S, Link
+from coseg._options import reachable
 from coseg.errors import BadReply, NoAnswer
 from coseg.v1 import daemon_pb2, message_pb2
 
@@ -68,3 +69,10 @@ def test_replies_nobody_waits_for_are_dropped_and_nonsense_is_told() -> None:
     assert link.receive(hello("one", "old"), 0.0) is None
     with pytest.raises(BadReply):
         link.receive(b"\xff\xff", 0.0)
+
+
+def test_events_come_from_the_host_that_is_known() -> None:
+    assert reachable("tcp://0.0.0.0:7001", "tcp://shapes:7000") == "tcp://shapes:7001"
+    assert reachable("tcp://[::]:7001", "tcp://[fe80::1]:7000") == "tcp://[fe80::1]:7001"
+    assert reachable("tcp://10.0.0.1:7001", "tcp://shapes:7000") == "tcp://10.0.0.1:7001"
+    assert reachable("ipc:///run/x.events", "ipc:///run/x") == "ipc:///run/x.events"

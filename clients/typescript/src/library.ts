@@ -651,13 +651,20 @@ export class Collection {
   async #eventEndpoint(patience: number): Promise<string> {
     for (let waited = 0; ; ) {
       try {
-        return (await this.library.hello()).eventEndpoint;
+        return reachable((await this.library.hello()).eventEndpoint, this.library.endpoint);
       } catch (e) {
         waited += this.library.transport.timeout;
         if (!(e instanceof NoAnswer) || waited >= patience) throw e;
       }
     }
   }
+}
+
+/** A daemon that listens on all addresses names none: then the host is the one that is known. */
+export function reachable(announced: string, endpoint: string): string {
+  const every = /^tcp:\/\/(?:0\.0\.0\.0|\[::\]|\*):(\d+)$/.exec(announced);
+  const known = /^tcp:\/\/(.+):\d+$/.exec(endpoint);
+  return every && known ? `tcp://${known[1]}:${every[1]}` : announced;
 }
 
 function spec(settings: Settings): CollectionSpec {

@@ -112,6 +112,8 @@ export class Raw {
 
 /** The format of that name or file extension. */
 export function meshFormat(name: string): MeshFormat {
+  // A GLB is a glTF in one binary file.
+  if (name.toLowerCase() === "glb") return MeshFormat.GLTF;
   const format = MeshFormat[name.toUpperCase() as keyof typeof MeshFormat];
   if (typeof format !== "number" || format === MeshFormat.UNSPECIFIED) throw new BadMesh(`${name} is no mesh format`);
   return format;

@@ -3,6 +3,7 @@ import { test } from "node:test";
 import { create, toBinary } from "@bufbuild/protobuf";
 import { BadReply, NoAnswer } from "../src/errors.js";
 import { ReplySchema } from "../src/gen/coseg/v1/message_pb.js";
+import { reachable } from "../src/library.js";
 import { Link, RESEND_MS } from "../src/link.js";
 
 const hello = (instance: string, requestId = "?1") =>
@@ -50,4 +51,10 @@ test("nonsense is told, and replies nobody waits for are dropped", () => {
   const link = new Link("e", 3);
   assert.equal(link.receive(hello("one", "old"), 0), undefined);
   assert.throws(() => link.receive(new Uint8Array([255, 255]), 0), BadReply);
+});
+
+test("events come from the host that is known", () => {
+  assert.equal(reachable("tcp://0.0.0.0:7001", "tcp://shapes:7000"), "tcp://shapes:7001");
+  assert.equal(reachable("tcp://10.0.0.1:7001", "tcp://shapes:7000"), "tcp://10.0.0.1:7001");
+  assert.equal(reachable("ipc:///run/x.events", "ipc:///run/x"), "ipc:///run/x.events");
 });

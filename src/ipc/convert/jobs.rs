@@ -223,6 +223,7 @@ pub fn item(i: &JobItem, live_stage: Option<&str>) -> wire::JobItem {
     let mut wire = wire::JobItem {
         index: i.index,
         name: i.name.clone(),
+        attempts: i.attempts,
         ..Default::default()
     };
     let state = match (&i.state, live_stage) {

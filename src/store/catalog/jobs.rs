@@ -42,6 +42,24 @@ impl Reader<'_> {
         )
     }
 
+    /// Jobs before `before`, newest first, at most `limit`: all, or those of which an item failed; of all
+    /// collections, or of one.
+    pub fn jobs(
+        &self,
+        before: u64,
+        failed: bool,
+        collection: Option<&str>,
+        limit: usize,
+    ) -> Result<Vec<JobRow>> {
+        let before = i64::try_from(before).unwrap_or(i64::MAX);
+        let limit = i64::try_from(limit).unwrap_or(i64::MAX);
+        let tail = "WHERE id < ?1 AND (?2 IS NULL OR collection = ?2) AND (NOT ?3 OR EXISTS (
+                      SELECT 1 FROM job_items WHERE job_id = jobs.id AND status = 'failed'))
+                    ORDER BY id DESC LIMIT ?4";
+        let params = params![before, collection, failed, limit];
+        self.all(&JOBS, tail, params, job_row)
+    }
+
     /// The items of all jobs that are not done, in the order of acceptance.
     pub fn queued_items(&self) -> Result<Vec<JobItemRow>> {
         let tail = "WHERE status = 'queued' ORDER BY job_id, idx";
@@ -154,8 +172,8 @@ impl Tx<'_> {
 
     /// Forgets answers older than `keep_secs`, which counts as at least 24 h; how many.
     ///
-    /// To be called about hourly. If the wall clock has jumped since the last call (or nobody
-    /// called for a day), the answers age by nothing for that time, so that a jump forgets none.
+    /// To be called about hourly, before [`Tx::purge_jobs`]. If the wall clock has jumped since the last call (or nobody
+    /// called for a day), answers and jobs age by nothing for that time, so that a jump forgets none.
     pub fn purge_requests(&self, now_unix_secs: u64, keep_secs: u64) -> Result<u64> {
         let now = now_unix_secs.min(i64::MAX as u64);
         let last = self
@@ -166,6 +184,10 @@ impl Tx<'_> {
             let jump = now as i64 - last as i64;
             self.execute(
                 "UPDATE requests SET created = min(created + ?1, ?2)",
+                [jump, now as i64],
+            )?;
+            self.execute(
+                "UPDATE jobs SET created = min(created + ?1, ?2)",
                 [jump, now as i64],
             )?;
         }

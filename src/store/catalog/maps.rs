@@ -58,6 +58,15 @@ impl Reader<'_> {
         let shapes = statement.query_map([from], |row| row.get(0))?;
         Ok(shapes.collect::<rusqlite::Result<_>>()?)
     }
+
+    /// Which maps there are: from, to. Their rows are not read.
+    pub fn map_keys(&self) -> Result<Vec<(ShapeId, ShapeId)>> {
+        let mut statement = self.connection().prepare_cached(
+            "SELECT from_shape, to_shape FROM maps ORDER BY from_shape, to_shape",
+        )?;
+        let keys = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?;
+        Ok(keys.collect::<rusqlite::Result<_>>()?)
+    }
 }
 
 impl Tx<'_> {

@@ -212,7 +212,7 @@ const INDEXES: &str = "
 
 /// Makes `row_sum` known to a connection: of any number of values the first eight bytes of a BLAKE3
 /// over each value's type, length and bytes.
-pub(super) fn register_row_sum(connection: &Connection) -> rusqlite::Result<()> {
+pub(in crate::store) fn register_row_sum(connection: &Connection) -> rusqlite::Result<()> {
     let flags = FunctionFlags::SQLITE_UTF8
         | FunctionFlags::SQLITE_DETERMINISTIC
         | FunctionFlags::SQLITE_INNOCUOUS;
@@ -287,7 +287,10 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
 }
 
 /// Refuses files that are not a catalog of a format this version reads.
-pub(super) fn check_format(connection: &Connection, path: &str) -> Result<(), StoreError> {
+pub(in crate::store) fn check_format(
+    connection: &Connection,
+    path: &str,
+) -> Result<(), StoreError> {
     let pragma = |name: &str| -> rusqlite::Result<u32> {
         connection.pragma_query_value(None, name, |row| row.get(0))
     };

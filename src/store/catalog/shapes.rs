@@ -212,11 +212,19 @@ impl Tx<'_> {
                 AND digest NOT IN (SELECT description_digest FROM shapes))
                OR (kind = 'original'
                 AND digest NOT IN (SELECT content_digest FROM shapes)
-                AND digest NOT IN (SELECT original_digest FROM job_items WHERE status = 'queued'))
+                AND digest NOT IN (SELECT original_digest FROM job_items WHERE status IN ('queued', 'failed')))
              RETURNING file",
         )?;
         let files = statement.query_map([], |row| row.get(0))?;
         Ok(files.collect::<rusqlite::Result<_>>()?)
+    }
+
+    /// Writes the global descriptor of a shape, in the place of one that cannot be read.
+    pub fn put_signature(&self, shape: ShapeId, signature: &[f32]) -> Result<()> {
+        self.execute("DELETE FROM shape_signatures WHERE shape_id = ?1", [shape])?;
+        let signature = floats_to_blob(signature);
+        self.insert(&SHAPE_SIGNATURES, shape, params![shape, signature])?;
+        Ok(())
     }
 
     /// Inserts a shape, whose object files must be catalogued. It has no labels yet: the first

@@ -16,7 +16,7 @@ from coseg import types as t
 from coseg._sync_transport import Subscription, Transport
 from coseg._batch import Batch, Item, batches
 from coseg._link import Frame
-from coseg._options import Curve, default_endpoint, new_client_id
+from coseg._options import Curve, default_endpoint, new_client_id, reachable
 from coseg._wire import FrameWriter, Mesh, Raw
 from coseg.errors import BadReply, CosegError, EventLogRewound, NoAnswer, Refused
 from coseg.v1 import collection_pb2, event_pb2, message_pb2
@@ -508,7 +508,8 @@ class Collection:
         """
         seen = since if since is not None else (self.info()).sequence
         while True:
-            endpoint = (self._patiently(patience)).event_endpoint
+            hello = self._patiently(patience)
+            endpoint = reachable(hello.event_endpoint, self.library.endpoint)
             topics = [self.name.encode() + b"\0", HEARTBEAT_TOPIC]
             with self.library._transport.subscribe(endpoint, topics) as subscription:
                 for event in self._follow(subscription, seen):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import uuid
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +42,13 @@ def default_endpoint() -> str:
         if directory := os.environ.get(variable):
             return f"ipc://{directory}{below}/coseg.sock"
     return f"ipc:///tmp/coseg-{os.getuid()}/coseg.sock"
+
+
+def reachable(announced: str, endpoint: str) -> str:
+    """Where events come from: a daemon that listens on all addresses names none, so the host is ours."""
+    every = re.fullmatch(r"tcp://(?:0\.0\.0\.0|\[::\]|\*):(\d+)", announced)
+    known = re.fullmatch(r"tcp://(.+):\d+", endpoint)
+    return f"tcp://{known[1]}:{every[1]}" if every and known else announced
 
 
 def new_client_id() -> str:

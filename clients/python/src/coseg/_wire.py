@@ -108,6 +108,8 @@ def shape_input(name: str, mesh: Mesh, replace: bool, writer: FrameWriter) -> jo
 
 def mesh_format(name: str) -> Any:
     """The format of that name or file extension."""
+    # A GLB is a glTF in one binary file.
+    name = "gltf" if name.lower() == "glb" else name
     key = f"MESH_FORMAT_{name.upper()}"
     if name.lower() == "unspecified" or key not in job_pb2.MeshFormat.keys():
         known = ", ".join(n.removeprefix("MESH_FORMAT_").lower() for n in job_pb2.MeshFormat.keys()[1:])

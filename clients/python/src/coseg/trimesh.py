@@ -19,6 +19,9 @@ def labelled(collection: Collection, name: str) -> Any:
     import trimesh
 
     original = collection.original(name)
+    if original.format == "gltf":
+        # Nodes may come in another order there than the daemon's.
+        raise CosegError(f"{name!r} is a glTF; `coseg export --format glb` writes it with its labels")
     # Anything that trimesh does to the faces would put the labels on the wrong ones.
     mesh: Any = trimesh.load(
         io.BytesIO(original.data),

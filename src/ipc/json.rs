@@ -1,6 +1,6 @@
 //! What the daemon says, as JSON.
 
-use coseg::ipc::wire::{self, event::Kind};
+use crate::ipc::wire::{self, event::Kind};
 use serde_json::{Map, Value, json};
 
 /// The name of an enum value without its prefix, in lower case.
@@ -10,7 +10,8 @@ fn short(name: &str, prefix: &str) -> String {
         .to_ascii_lowercase()
 }
 
-pub(crate) fn up(up: wire::Up) -> &'static str {
+/// An up axis, as it is typed.
+pub fn up(up: wire::Up) -> &'static str {
     match up {
         wire::Up::PlusX => "+x",
         wire::Up::MinusX => "-x",
@@ -23,16 +24,18 @@ pub(crate) fn up(up: wire::Up) -> &'static str {
     }
 }
 
-pub(crate) fn outcome(outcome: wire::Outcome) -> String {
+/// What became of an added shape.
+pub fn outcome(outcome: wire::Outcome) -> String {
     short(outcome.as_str_name(), "OUTCOME_")
 }
 
 /// `#rrggbb`.
-pub(crate) fn colour(rgb: u32) -> String {
+pub fn colour(rgb: u32) -> String {
     format!("#{:06x}", rgb & 0xff_ffff)
 }
 
-pub(crate) fn collection(c: &wire::Collection) -> Value {
+/// A collection with its labels.
+pub fn collection(c: &wire::Collection) -> Value {
     let spec = c.spec.clone().unwrap_or_default();
     json!({
         "name": spec.name,
@@ -47,7 +50,8 @@ pub(crate) fn collection(c: &wire::Collection) -> Value {
     })
 }
 
-pub(crate) fn label(l: &wire::LabelInfo) -> Value {
+/// A label.
+pub fn label(l: &wire::LabelInfo) -> Value {
     json!({
         "id": l.id,
         "name": Some(&l.name).filter(|n| !n.is_empty()),
@@ -57,7 +61,8 @@ pub(crate) fn label(l: &wire::LabelInfo) -> Value {
     })
 }
 
-pub(crate) fn shape(s: &wire::Shape) -> Value {
+/// A shape with its parts and sources.
+pub fn shape(s: &wire::Shape) -> Value {
     let parts = s.parts.iter().map(
         |p| json!({ "label": p.label, "area_share": p.area_share, "confidence": p.confidence }),
     );
@@ -100,7 +105,7 @@ fn report(r: &wire::CleanReport) -> Value {
 }
 
 /// One shape of a job; times in milliseconds by stage.
-pub(crate) fn job_item(i: &wire::JobItem) -> Value {
+pub fn job_item(i: &wire::JobItem) -> Value {
     let mut value =
         json!({ "name": i.name, "outcome": short(i.state().as_str_name(), "ITEM_STATE_") });
     if let Some(p) = &i.placed {
@@ -118,7 +123,8 @@ pub(crate) fn job_item(i: &wire::JobItem) -> Value {
     value
 }
 
-pub(crate) fn error(e: &wire::Error) -> Value {
+/// An error: code, reason, message.
+pub fn error(e: &wire::Error) -> Value {
     json!({
         "code": e.code().as_str_name().trim_start_matches("ERROR_CODE_"),
         "reason": e.reason().as_str_name().trim_start_matches("ERROR_REASON_"),
@@ -126,7 +132,8 @@ pub(crate) fn error(e: &wire::Error) -> Value {
     })
 }
 
-pub(crate) fn quality(q: &wire::MapQuality) -> Value {
+/// How good a functional map is.
+pub fn quality(q: &wire::MapQuality) -> Value {
     json!({
         "descriptor_residual": q.descriptor_residual,
         "orthogonality": q.orthogonality,
@@ -139,7 +146,8 @@ pub(crate) fn quality(q: &wire::MapQuality) -> Value {
     })
 }
 
-pub(crate) fn part_match(m: &wire::PartMatch) -> Value {
+/// A pair of matching parts.
+pub fn part_match(m: &wire::PartMatch) -> Value {
     json!({
         "part_a": m.part_a,
         "part_b": m.part_b,
@@ -150,7 +158,7 @@ pub(crate) fn part_match(m: &wire::PartMatch) -> Value {
 }
 
 /// An event, flat: `kind` and what belongs to it beside sequence and collection.
-pub(crate) fn event(e: &wire::Event) -> Value {
+pub fn event(e: &wire::Event) -> Value {
     let (kind, body) = match &e.kind {
         None => ("unknown", json!({})),
         Some(Kind::CollectionCreated(_)) => ("collection_created", json!({})),
@@ -211,7 +219,7 @@ pub(crate) fn event(e: &wire::Event) -> Value {
 }
 
 /// An event as one line for people.
-pub(crate) fn event_line(e: &wire::Event) -> String {
+pub fn event_line(e: &wire::Event) -> String {
     let percent = |share: f64| format!("{:.0} %", share * 100.0);
     let body = match &e.kind {
         None => "unknown event".to_owned(),

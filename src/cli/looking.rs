@@ -1,0 +1,41 @@
+//! What a person types to look at a library or at the daemon.
+
+use super::InCollection;
+use clap::Args;
+use std::path::PathBuf;
+
+/// `coseg view`
+#[derive(Debug, Args)]
+pub(crate) struct View {
+    /// The collection; may be left out if there is only one
+    #[arg(value_name = "COLLECTION", conflicts_with = "collection")]
+    pub(crate) name: Option<String>,
+    #[command(flatten)]
+    pub(crate) within: InCollection,
+    /// The HTML file to write
+    #[arg(long, short, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+    /// At most this many shapes, in the order of their arrival
+    #[arg(long, value_name = "N")]
+    pub(crate) max: Option<usize>,
+    /// Shapes that come with eigenfunctions and heat kernel signature, about 70 kB each
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    pub(crate) functions: usize,
+    /// Shapes that come with functional maps, two each of about 7 kB
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    pub(crate) maps: usize,
+    /// Do not wait for shapes and relabellings that are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg top`
+#[derive(Debug, Args)]
+pub(crate) struct Top {
+    /// Seconds between looks
+    #[arg(long, short, value_name = "SECONDS", default_value = "1", value_parser = super::seconds)]
+    pub(crate) interval: std::time::Duration,
+    /// End after this many looks
+    #[arg(long, short = 'n', value_name = "N")]
+    pub(crate) limit: Option<u64>,
+}

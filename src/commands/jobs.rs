@@ -1,0 +1,127 @@
+//! `coseg jobs` and `coseg retry`: what became of what was added, and trying again what failed.
+
+use super::session::{Session, table};
+use super::{CommandError, Outcome};
+use crate::cli::{Jobs, Retry};
+use coseg::call;
+use coseg::ipc::wire::{self, ItemState};
+use serde_json::{Value, json};
+
+pub(crate) fn jobs(args: &Jobs, mut session: Session) -> Outcome {
+    let mut before = 0;
+    let mut jobs = Vec::new();
+    loop {
+        let request = wire::ListJobsRequest {
+            failed: args.failed,
+            before,
+            page_size: 0,
+            collection: args.collection.clone().unwrap_or_default(),
+        };
+        let reply = call!(session.client, ListJobs(request))?;
+        before = reply.jobs.last().map_or(0, |j| j.job_id);
+        jobs.extend(reply.jobs);
+        if !reply.more || args.limit.is_some_and(|n| jobs.len() as u64 >= n) {
+            break;
+        }
+    }
+    if let Some(limit) = args.limit {
+        jobs.truncate(usize::try_from(limit).unwrap_or(usize::MAX));
+    }
+    if session.json {
+        let jobs: Vec<_> = jobs.iter().map(to_json).collect();
+        session.print_json(&json!({ "jobs": jobs }))?;
+        return Ok(true);
+    }
+    if args.failed {
+        for job in &jobs {
+            for item in &job.items {
+                session.line(&format!(
+                    "job {} {}/{}: {}",
+                    job.job_id,
+                    job.collection,
+                    item.name,
+                    why(item)
+                ))?;
+            }
+        }
+        return Ok(true);
+    }
+    let heading = ["job", "collection", "shapes", "done", "failed", "left"];
+    let mut rows = vec![heading.map(str::to_owned).to_vec()];
+    for job in &jobs {
+        let count = |states: &[ItemState]| {
+            let n = job.items.iter().filter(|i| states.contains(&i.state()));
+            n.count().to_string()
+        };
+        rows.push(vec![
+            job.job_id.to_string(),
+            job.collection.clone(),
+            job.items.len().to_string(),
+            count(&[ItemState::Done]),
+            count(&[ItemState::Failed, ItemState::Cancelled]),
+            count(&[ItemState::Queued, ItemState::Running]),
+        ]);
+    }
+    session.line(&table(&rows))?;
+    Ok(true)
+}
+
+pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
+    let request = wire::RetryJobRequest { job_id: args.job };
+    let reply = call!(session.client, RetryJob(request))?;
+    let mut job = reply.job.unwrap_or_default();
+    let mut revision = 0;
+    while !args.no_wait && !job.finished {
+        job = session.watch_job(args.job, &mut revision)?;
+    }
+    let failed: Vec<_> = job
+        .items
+        .iter()
+        .filter(|i| i.state() == ItemState::Failed)
+        .collect();
+    if session.json {
+        session.print_json(&json!({ "n_queued": reply.n_queued, "job": to_json(&job) }))?;
+    } else {
+        for item in &failed {
+            eprintln!("{}: {}", item.name, why(item));
+        }
+        eprintln!("{} shapes were queued again", reply.n_queued);
+    }
+    if reply.n_queued == 0 && !session.json {
+        return Err(CommandError::Failed(format!(
+            "no shape of job {} has failed",
+            args.job
+        )));
+    }
+    Ok(args.no_wait || failed.is_empty())
+}
+
+fn why(item: &wire::JobItem) -> String {
+    item.error
+        .as_ref()
+        .map_or_else(String::new, |e| e.message.clone())
+}
+
+fn to_json(job: &wire::Job) -> Value {
+    let items = job.items.iter().map(|i| {
+        let error = i.error.as_ref().map(|e| {
+            json!({
+                "code": e.code().as_str_name().trim_start_matches("ERROR_CODE_"),
+                "reason": e.reason().as_str_name().trim_start_matches("ERROR_REASON_"),
+                "message": e.message,
+            })
+        });
+        json!({
+            "name": i.name,
+            "state": i.state().as_str_name().trim_start_matches("ITEM_STATE_").to_lowercase(),
+            "attempts": i.attempts,
+            "error": error,
+        })
+    });
+    json!({
+        "job": job.job_id,
+        "collection": job.collection,
+        "finished": job.finished,
+        "shapes": items.collect::<Vec<_>>(),
+    })
+}

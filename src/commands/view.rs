@@ -1,0 +1,175 @@
+//! `coseg view`: a collection becomes one HTML file, the viewer with everything inside.
+
+use super::session::{Session, bar};
+use super::{CommandError, Outcome, events, json};
+use crate::cli::View;
+use coseg::call;
+use coseg::ipc::client::ClientError;
+use coseg::ipc::frames::{FrameError, FrameReader};
+use coseg::ipc::wire;
+use coseg::viewer::{Embedded, portrait};
+use serde_json::{Map, Value, json};
+
+/// Shapes of one pack: the first one is on the screen before the others are read.
+const BATCH: usize = 25;
+/// Neighbours of each shape.
+const N_NEIGHBORS: u32 = 6;
+/// Maps of each shape: from those that its labels were carried from, or that are nearest.
+const N_MAPS: usize = 2;
+
+pub(crate) fn run(args: &View, mut session: Session) -> Outcome {
+    let collection = match &args.name {
+        Some(name) => name.clone(),
+        None => session.collection(&args.within)?,
+    };
+    if !args.no_wait {
+        session.wait_until_idle(&collection)?;
+    }
+    let about = session.describe(&collection)?;
+    let mut shapes = session.shapes(&collection, None)?;
+    let n_stored = shapes.len();
+    shapes.truncate(args.max.unwrap_or(usize::MAX));
+    let names: Vec<String> = shapes.iter().map(|s| s.name.clone()).collect();
+    let mut embedded = Embedded::default();
+    let compressed = |e: std::io::Error| CommandError::Failed(format!("compressing: {e}"));
+    let progress = bar(shapes.len() as u64);
+    for (i, batch) in names.chunks(BATCH).enumerate() {
+        let pack = portraits(
+            &mut session,
+            &collection,
+            batch,
+            wire::PortraitDetail::Proxy,
+        )?;
+        embedded
+            .push("portraits", &i.to_string(), &pack)
+            .map_err(compressed)?;
+    }
+    let (mut neighbors, mut maps) = (Map::new(), Vec::new());
+    for (i, shape) in shapes.iter().enumerate() {
+        progress.set_message(shape.name.clone());
+        let near = nearest(&mut session, &collection, &shape.name)?;
+        if i < args.functions {
+            let of = std::slice::from_ref(&shape.name);
+            let detail = wire::PortraitDetail::Functions;
+            let pack = portraits(&mut session, &collection, of, detail)?;
+            embedded
+                .push("functions", &i.to_string(), &pack)
+                .map_err(compressed)?;
+        }
+        if i < args.maps {
+            for from in mapped_from(shape, &near, &names) {
+                let pack = map(&mut session, &collection, &from, &shape.name)?;
+                let key = maps.len().to_string();
+                embedded.push("map", &key, &pack).map_err(compressed)?;
+                maps.push(json!([from, shape.name]));
+            }
+        }
+        let near = near.iter().map(|n| json!([n.shape, n.distance]));
+        neighbors.insert(shape.name.clone(), near.collect());
+        progress.inc(1);
+    }
+    progress.finish_and_clear();
+    let log = events::since(&mut session, &collection, 0, None)?;
+    let log: Vec<Value> = log.iter().map(json::event).collect();
+    let n_functions = args.functions.min(shapes.len());
+    let catalogue = json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "collection": json::collection(&about),
+        "shapes": shapes.iter().map(json::shape).collect::<Vec<_>>(),
+        "n_stored": n_stored,
+        "neighbors": neighbors,
+        "functions": names[..n_functions],
+        "maps": maps,
+        "events": log,
+    });
+    let page = embedded.page(&catalogue);
+    std::fs::write(&args.out, &page).map_err(|source| CommandError::File {
+        path: args.out.display().to_string(),
+        source,
+    })?;
+    let n_maps = maps.len();
+    if session.json {
+        session.print_json(&json!({
+            "collection": collection,
+            "file": args.out.display().to_string(),
+            "n_bytes": page.len(),
+            "n_shapes": shapes.len(),
+            "n_left_out": n_stored - shapes.len(),
+            "n_functions": n_functions,
+            "n_maps": n_maps,
+        }))?;
+    } else {
+        let mb = page.len() as f64 / 1e6;
+        eprintln!(
+            "{} shapes, {n_functions} with functions, {n_maps} maps: {mb:.1} MB in {}",
+            shapes.len(),
+            args.out.display()
+        );
+        if shapes.len() > n_functions || n_stored > shapes.len() {
+            eprintln!("--max, --functions and --maps say how much goes in");
+        }
+    }
+    Ok(true)
+}
+
+fn bad(e: FrameError) -> CommandError {
+    CommandError::Client(ClientError::BadReply(e.to_string()))
+}
+
+fn portraits(
+    session: &mut Session,
+    collection: &str,
+    shapes: &[String],
+    detail: wire::PortraitDetail,
+) -> Result<Vec<u8>, CommandError> {
+    let request = wire::GetPortraitsRequest {
+        collection: collection.to_owned(),
+        shapes: shapes.to_vec(),
+        detail: detail.into(),
+    };
+    let (reply, frames) = call!(session.client, GetPortraits(request), frames)?;
+    let pack = FrameReader::new(&frames).file(reply.pack.as_ref(), "pack");
+    Ok(pack.map_err(bad)?.to_vec())
+}
+
+fn nearest(
+    session: &mut Session,
+    collection: &str,
+    shape: &str,
+) -> Result<Vec<wire::Neighbor>, CommandError> {
+    let request = wire::NearestRequest {
+        collection: collection.to_owned(),
+        shape: shape.to_owned(),
+        limit: N_NEIGHBORS,
+    };
+    Ok(call!(session.client, Nearest(request))?.neighbors)
+}
+
+/// Shapes of the file from which maps to `shape` are worth showing; those that labels came along are kept already.
+fn mapped_from(shape: &wire::Shape, near: &[wire::Neighbor], names: &[String]) -> Vec<String> {
+    let sources = shape.sources.iter().map(|s| &s.shape);
+    let mut from: Vec<String> = Vec::new();
+    for name in sources.chain(near.iter().map(|n| &n.shape)) {
+        if from.len() < N_MAPS && names.contains(name) && !from.contains(name) {
+            from.push(name.clone());
+        }
+    }
+    from
+}
+
+fn map(
+    session: &mut Session,
+    collection: &str,
+    from: &str,
+    to: &str,
+) -> Result<Vec<u8>, CommandError> {
+    #[allow(clippy::needless_update)] // the message may gain fields
+    let request = wire::GetFunctionalMapRequest {
+        collection: collection.to_owned(),
+        from: from.to_owned(),
+        to: to.to_owned(),
+        ..Default::default()
+    };
+    let (reply, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
+    portrait::map(from, to, &reply, &frames).map_err(bad)
+}

@@ -1,0 +1,212 @@
+//! Who may connect and what each may ask: the ZAP handler and the roles.
+//!
+//! Without keys the socket's directory, or the loopback interface, decides who gets here. With keys every
+//! connection is CURVE, and the allow list is asked twice: when a connection is made (ZAP, ZeroMQ RFC 27),
+//! and again for each request, so that a key that is revoked is refused at once.
+
+use crate::ipc::convert;
+use crate::ipc::keys::{
+    ALLOW_FILE, AllowList, KeyError, KeyPair, PublicKey, Role, SERVER_KEY_FILE,
+};
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, request::Body};
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Where ZeroMQ asks about connections.
+pub(crate) const ZAP_ENDPOINT: &str = "inproc://zeromq.zap.01";
+
+/// Inode, length and time of change of the allow list; none where it is missing.
+type Stamp = Option<(u64, u64, i64, i64)>;
+
+/// Who may do what.
+pub(crate) enum Access {
+    /// Whoever can connect, with this role.
+    Open(Role),
+    /// Whoever is on the list.
+    Keys(Keys),
+}
+
+/// The daemon's key, and the list.
+pub(crate) struct Keys {
+    server: KeyPair,
+    path: PathBuf,
+    list: Mutex<(Stamp, Arc<AllowList>)>,
+}
+
+impl Access {
+    /// As the folder of keys says; open without one.
+    pub(crate) fn new(keys: &Path) -> Result<Self, KeyError> {
+        if keys.as_os_str().is_empty() {
+            // Over TCP, draining is refused all the same: anybody on the machine can connect.
+            return Ok(Self::Open(Role::Admin));
+        }
+        let path = keys.join(ALLOW_FILE);
+        let list = Arc::new(AllowList::read(&path)?);
+        Ok(Self::Keys(Keys {
+            server: KeyPair::read(&keys.join(SERVER_KEY_FILE))?,
+            list: Mutex::new((stamp(&path), list)),
+            path,
+        }))
+    }
+
+    /// Reads the allow list again if its file has changed, or if `always`. True if somebody was taken off it
+    /// or may do less.
+    pub(crate) fn reload(&self, always: bool) -> bool {
+        let Self::Keys(keys) = self else { return false };
+        let found = stamp(&keys.path);
+        let mut list = keys.list.lock().unwrap_or_else(PoisonError::into_inner);
+        if list.0 == found && !always {
+            return false;
+        }
+        match AllowList::read(&keys.path) {
+            Ok(new) => {
+                let gone = list
+                    .1
+                    .clients()
+                    .iter()
+                    .any(|old| new.find(old.key.as_str()).is_none());
+                if *list.1 != new {
+                    tracing::info!(
+                        clients = new.clients().len(),
+                        "the allow list was read again"
+                    );
+                }
+                *list = (found, Arc::new(new));
+                gone
+            }
+            Err(e) => {
+                // Told once for each change of the file.
+                tracing::error!(error = %e, "the allow list stays as it was");
+                list.0 = found;
+                false
+            }
+        }
+    }
+
+    /// Makes a socket that is to be bound take only connections that are allowed.
+    pub(crate) fn protect(&self, socket: &zmq::Socket) -> Result<(), zmq::Error> {
+        match self {
+            Self::Open(_) => Ok(()),
+            Self::Keys(keys) => keys.server.serve(socket),
+        }
+    }
+
+    /// Answers a question of ZeroMQ: its frames, and those of the reply. The user id is the key.
+    pub(crate) fn zap(&self, question: &[Vec<u8>]) -> Vec<Vec<u8>> {
+        let id = question.get(1).cloned().unwrap_or_default();
+        let [_, _, _, address, _, mechanism, key] = question else {
+            return zap_reply(id, "500", "the question has another number of frames", "");
+        };
+        let key = PublicKey::from_bytes(key).filter(|_| mechanism == b"CURVE");
+        let (Self::Keys(keys), Some(key)) = (self, key) else {
+            return zap_reply(id, "400", "only keys are let in", "");
+        };
+        let address = String::from_utf8_lossy(address);
+        match keys.list().find(key.as_str()) {
+            Some(client) => {
+                tracing::debug!(name = client.name, %address, "a client connects");
+                zap_reply(id, "200", "", key.as_str())
+            }
+            None => {
+                tracing::warn!(%key, %address, "a key that is not on the allow list was refused");
+                zap_reply(id, "400", "the key is not on the allow list", "")
+            }
+        }
+    }
+
+    /// Refuses a request that its sender may not make. `user` is the key, as ZeroMQ vouches for it.
+    pub(crate) fn check(&self, user: Option<&str>, body: Option<&Body>) -> Result<(), wire::Error> {
+        let needed = body.map_or(Role::ReadOnly, needed);
+        let (role, name) = match self {
+            Self::Open(role) => (*role, String::new()),
+            Self::Keys(keys) => {
+                let list = keys.list();
+                let Some(client) = user.and_then(|key| list.find(key)) else {
+                    return Err(convert::error(
+                        ErrorCode::PermissionDenied,
+                        ErrorReason::KeyNotAllowed,
+                        "the client's key is not, or no longer, on the allow list",
+                    ));
+                };
+                (client.role, client.name.clone())
+            }
+        };
+        if role >= needed {
+            return Ok(());
+        }
+        let text = format!("{name:?} has the role {role}, but this request needs {needed}");
+        Err(convert::error(
+            ErrorCode::PermissionDenied,
+            ErrorReason::RoleTooLow,
+            text,
+        ))
+    }
+
+    /// Whether every connection is authenticated.
+    pub(crate) fn has_keys(&self) -> bool {
+        matches!(self, Self::Keys(_))
+    }
+}
+
+impl Keys {
+    fn list(&self) -> Arc<AllowList> {
+        Arc::clone(&self.list.lock().unwrap_or_else(PoisonError::into_inner).1)
+    }
+}
+
+/// The least role that may make a request.
+fn needed(body: &Body) -> Role {
+    match body {
+        Body::Hello(_)
+        | Body::Stats(_)
+        | Body::ListCollections(_)
+        | Body::DescribeCollection(_)
+        | Body::GetJob(_)
+        | Body::ListJobs(_)
+        | Body::WatchJob(_)
+        | Body::WaitIdle(_)
+        | Body::ListShapes(_)
+        | Body::GetShape(_)
+        | Body::GetLabels(_)
+        | Body::GetOriginal(_)
+        | Body::LabelsSnapshot(_)
+        | Body::GetSpectrum(_)
+        | Body::GetHks(_)
+        | Body::GetDescriptors(_)
+        | Body::GetFunctionalMap(_)
+        | Body::GetPartCorrespondence(_)
+        | Body::Nearest(_)
+        | Body::GetPortraits(_)
+        | Body::TransferFunction(_)
+        | Body::SuggestNext(_)
+        | Body::EventsSince(_) => Role::ReadOnly,
+        Body::CreateCollection(_)
+        | Body::NameLabel(_)
+        | Body::CorrectLabels(_)
+        | Body::MergeLabels(_)
+        | Body::SplitLabel(_)
+        | Body::Undo(_)
+        | Body::AddShapes(_)
+        | Body::CancelJob(_)
+        | Body::RemoveShape(_) => Role::Ingest,
+        Body::DeleteCollection(_) | Body::RetryJob(_) | Body::Drain(_) => Role::Admin,
+    }
+}
+
+fn zap_reply(id: Vec<u8>, status: &str, text: &str, user: &str) -> Vec<Vec<u8>> {
+    let frame = |text: &str| text.as_bytes().to_vec();
+    vec![
+        frame("1.0"),
+        id,
+        frame(status),
+        frame(text),
+        frame(user),
+        Vec::new(),
+    ]
+}
+
+fn stamp(path: &Path) -> Stamp {
+    let m = std::fs::metadata(path).ok()?;
+    Some((m.ino(), m.len(), m.mtime(), m.mtime_nsec()))
+}

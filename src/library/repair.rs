@@ -1,0 +1,133 @@
+//! What is damaged and can be computed again is, from the stored mesh.
+//!
+//! The bytes that a person sent, labels, corrections and events cannot be computed: where one of these is
+//! damaged the repair says so, and a snapshot is needed. Descriptions, signatures, maps and indexes can.
+
+use super::isolate::DescribeJob;
+use super::rows::format_from_name;
+use super::submit::{algorithm, params_of};
+use super::{Library, LibraryError, Result};
+use crate::store::check::Finding;
+use crate::store::quarantine::rebuild_indexes;
+use crate::store::{CollectionRow, Digest, ObjectKind, ShapeRow};
+use std::path::Path;
+
+/// What a repair did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Repaired {
+    /// What was mended, and what could not be, in words.
+    pub done: Vec<String>,
+    /// What a check found afterwards.
+    pub left: Vec<Finding>,
+}
+
+impl Library {
+    /// Mends what can be mended of the library in `dir`, which no process may hold. Damaged files are put into
+    /// `quarantine/`.
+    ///
+    /// # Errors
+    /// The library is held, or so damaged that it cannot be opened.
+    pub fn repair(dir: &Path) -> Result<Repaired> {
+        let mut done = Vec::new();
+        if rebuild_indexes(dir)? {
+            done.push("catalog.db: its indexes were built anew".to_owned());
+        }
+        let library = Self::open(dir)?;
+        let rows = library.store.catalog().read(|r| -> Result<_> {
+            let mut rows = Vec::new();
+            for collection in r.collections()? {
+                for shape in r.shapes(collection.id, 0, usize::MAX, None)? {
+                    rows.push((collection.clone(), shape));
+                }
+            }
+            Ok(rows)
+        })?;
+        for (collection, shape) in &rows {
+            match library.repair_shape(collection, shape) {
+                Ok(what) => done.extend(what),
+                Err(e) => done.push(format!(
+                    "{}/{}: not mended: {e}",
+                    collection.name, shape.name
+                )),
+            }
+        }
+        done.extend(library.drop_bad_maps()?);
+        drop(library);
+        Ok(Repaired {
+            done,
+            left: Self::check(dir)?,
+        })
+    }
+
+    /// The description and the signature of one shape.
+    fn repair_shape(&self, collection: &CollectionRow, shape: &ShapeRow) -> Result<Vec<String>> {
+        let mut done = Vec::new();
+        let place = format!("{}/{}", collection.name, shape.name);
+        let object = self.object(ObjectKind::Description, &shape.description_digest)?;
+        let whole = match self.store.objects().open_description(&object) {
+            Ok(mapped) => mapped,
+            Err(e) if e.is_damage() => {
+                let (params, params_json) = params_of(collection)?;
+                let name =
+                    Digest::of_description(&shape.content_digest, &params_json, &algorithm());
+                if name != shape.description_digest {
+                    done.push(format!(
+                        "{place}: {}: made by another version or on another kind of processor; add \
+                         the shape again with --replace",
+                        object.file
+                    ));
+                    return Ok(done);
+                }
+                let bytes = self.original_bytes(&shape.content_digest)?;
+                let job = DescribeJob {
+                    bytes: &bytes,
+                    format: format_from_name(&shape.format, "shapes.format")?,
+                    params,
+                };
+                let description = job.run(&|_| true).map_err(LibraryError::Refused)?;
+                self.store.put_aside(&object.file)?;
+                let again =
+                    self.store
+                        .objects()
+                        .put_description(name, &description, &params_json)?;
+                self.store
+                    .catalog()
+                    .write(|tx| -> Result<()> { Ok(tx.insert_object(&again)?) })?;
+                done.push(format!("{place}: {} was computed again", again.file));
+                self.store.objects().open_description(&again)?
+            }
+            Err(e) => return Err(e.into()),
+        };
+        let read = self
+            .store
+            .catalog()
+            .read(|r| -> Result<_> { Ok(r.signature(shape.id)?) });
+        if !matches!(read, Ok(Some(_))) {
+            let signature = whole.view().signature.to_vec();
+            self.store
+                .catalog()
+                .write(|tx| -> Result<()> { Ok(tx.put_signature(shape.id, &signature)?) })?;
+            done.push(format!(
+                "{place}: its signature was taken from its description"
+            ));
+        }
+        Ok(done)
+    }
+
+    /// Maps whose rows are damaged: they are computed again when they are asked for.
+    fn drop_bad_maps(&self) -> Result<Vec<String>> {
+        let catalog = self.store.catalog();
+        let keys = catalog.read(|r| -> Result<_> { Ok(r.map_keys()?) })?;
+        let mut done = Vec::new();
+        for (from, to) in keys {
+            match catalog.read(|r| -> Result<_> { Ok(r.map(from, to)?) }) {
+                Err(LibraryError::Store(e)) if e.is_damage() => {
+                    catalog.write(|tx| -> Result<()> { Ok(tx.delete_map(from, to)?) })?;
+                    done.push(format!("maps {from}, {to}: was forgotten"));
+                }
+                _ => {}
+            }
+        }
+        Ok(done)
+    }
+}

@@ -1,0 +1,127 @@
+//! A library becomes a copy of itself as of one moment, also while it is in use.
+//!
+//! The catalog is copied in one read transaction, then the files that the copy names: they are immutable, and
+//! one that the library lets go meanwhile stays for a day. The copy is complete under its name, or not there.
+
+use super::catalog::{self, Reader};
+use super::check::{Finding, check};
+use super::disk::{Disk, RealDisk};
+use super::objects::{FOLDERS, relative};
+use super::{StoreError, create_library_folder};
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// What was copied.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    /// Object files.
+    pub n_files: u64,
+    /// Bytes of all files.
+    pub n_bytes: u64,
+    /// What a check of the copy found; damage of the library is in its copy too.
+    pub findings: Vec<Finding>,
+}
+
+/// Copies the library in `from` to `to`, which must be missing or an empty folder, and verifies the copy. With
+/// `link` object files become hard links where that is possible: at once, without space, and damaged together.
+///
+/// # Errors
+/// There is no library, its catalog cannot be read, or the copy cannot be written; then nothing is left behind
+/// but a folder named `to` with `.partial`, if even that cannot be removed.
+pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> {
+    let at = |path: &Path| {
+        let path = path.to_path_buf();
+        move |e| StoreError::io(&path, e)
+    };
+    let source = catalog::path_in(from);
+    fs::metadata(&source).map_err(at(&source))?;
+    match fs::remove_dir(to) {
+        Ok(()) => {}
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+        Err(e) => return Err(StoreError::io(to, e)),
+    }
+    let mut partial = to.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = PathBuf::from(partial);
+    if partial.exists() {
+        let e = io::Error::from(io::ErrorKind::AlreadyExists);
+        return Err(StoreError::io(&partial, e));
+    }
+    let copied = copy_into(from, &partial, link).and_then(|counts| {
+        fs::rename(&partial, to).map_err(at(to))?;
+        let parent = to.parent().filter(|p| !p.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new("."));
+        RealDisk.sync_dir(parent).map_err(at(parent))?;
+        Ok(counts)
+    });
+    let (n_files, n_bytes) = match copied {
+        Ok(counts) => counts,
+        Err(e) => {
+            let _ = fs::remove_dir_all(&partial);
+            return Err(e);
+        }
+    };
+    Ok(Snapshot {
+        n_files,
+        n_bytes,
+        findings: check(to)?,
+    })
+}
+
+fn copy_into(from: &Path, to: &Path, link: bool) -> Result<(u64, u64), StoreError> {
+    create_library_folder(to)?;
+    let target = catalog::path_in(to);
+    let source = catalog::path_in(from);
+    let log = catalog::log_of(&source);
+    if let Some(message) = catalog::log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
+        return Err(StoreError::Damaged {
+            path: relative(from, &log),
+            message,
+        });
+    }
+    let connection = catalog::open_reader(&source)?;
+    connection.execute("VACUUM INTO ?1", [target.display().to_string()])?;
+    drop(connection);
+    sync(&target)?;
+    let connection = catalog::open_reader(&target)?;
+    let rows = Reader::new(&connection).objects()?;
+    drop(connection);
+    let mut folders: BTreeSet<PathBuf> = FOLDERS.iter().map(|f| to.join(f)).collect();
+    for folder in &folders {
+        fs::create_dir(folder).map_err(|e| StoreError::io(folder, e))?;
+    }
+    let (mut n_files, mut n_bytes) = (0, fs::metadata(&target).map_or(0, |m| m.len()));
+    for row in &rows {
+        let (source, target) = (from.join(&row.file), to.join(&row.file));
+        if let Some(folder) = target.parent() {
+            fs::create_dir_all(folder).map_err(|e| StoreError::io(folder, e))?;
+            folders.insert(folder.to_path_buf());
+        }
+        let linked = link && fs::hard_link(&source, &target).is_ok();
+        if !linked {
+            match fs::copy(&source, &target) {
+                Ok(_) => sync(&target)?,
+                // The check names it.
+                Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
+                Err(e) => return Err(StoreError::io(&target, e)),
+            }
+        }
+        n_files += 1;
+        n_bytes += row.length;
+    }
+    folders.insert(to.to_path_buf());
+    for folder in &folders {
+        RealDisk
+            .sync_dir(folder)
+            .map_err(|e| StoreError::io(folder, e))?;
+    }
+    Ok((n_files, n_bytes))
+}
+
+fn sync(path: &Path) -> Result<(), StoreError> {
+    File::open(path)
+        .and_then(|f| f.sync_all())
+        .map_err(|e| StoreError::io(path, e))
+}

@@ -1,0 +1,200 @@
+// All shapes in the colours of their labels, drawn when they come into sight.
+
+/** Milliseconds of a frame that drawing small pictures may take. */
+const BUDGET_MS = 30;
+/** Pictures that are drawn at once, in rows of so many. */
+const COLUMNS = 4;
+const $ = (id) => document.getElementById(id);
+
+/** An element with properties, attributes (`aria-…`, `data-…`, `role`) and children; strings become text. */
+function make(tag, properties = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [key, value] of Object.entries(properties))
+    if (key.includes("-") || key === "role") element.setAttribute(key, value);
+    else element[key] = value;
+  element.append(...children.filter((c) => c !== null && c !== undefined));
+  return element;
+}
+
+const css = ([r, g, b]) => `rgb(${r | 0} ${g | 0} ${b | 0})`;
+const swatch = (colour) => {
+  const element = make("span", { className: "swatch" });
+  element.style.background = css(colour);
+  return element;
+};
+const percent = (share) =>
+  share > 0 && share < 0.0005 ? "< 0.1 %" : `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)} %`;
+
+/** Draws small pictures of shapes, a few in each frame, those in sight first. */
+class Thumbnails {
+  constructor(app) {
+    this.app = app;
+    this.renderer = new Renderer(document.createElement("canvas"));
+    this.waiting = new Map();
+    this.running = false;
+  }
+
+  ask(canvas, name) {
+    this.waiting.set(canvas, name);
+    if (this.running) return;
+    this.running = true;
+    requestAnimationFrame(() => this.frame());
+  }
+
+  /** Draws as many as a frame has time for, side by side on one canvas: copying from it is what costs most. */
+  frame() {
+    const begin = performance.now();
+    const batch = [];
+    for (const [canvas, name] of this.waiting) {
+      this.waiting.delete(canvas);
+      const portrait = this.app.portraits.get(name);
+      if (portrait && canvas.isConnected) batch.push({ canvas, portrait, ...this.size(canvas) });
+      if (batch.length === COLUMNS * COLUMNS) break;
+    }
+    if (batch.length > 0) {
+      const { renderer } = this;
+      const width = Math.max(...batch.map((b) => b.width));
+      const height = Math.max(...batch.map((b) => b.height));
+      const size = [width * COLUMNS, height * COLUMNS];
+      if (renderer.canvas.width !== size[0] || renderer.canvas.height !== size[1])
+        [renderer.canvas.width, renderer.canvas.height] = size;
+      renderer.clear();
+      let n = 0;
+      do {
+        this.draw(batch[n], [(n % COLUMNS) * width, Math.floor(n / COLUMNS) * height]);
+        n++;
+      } while (n < batch.length && performance.now() - begin < BUDGET_MS);
+      for (const { canvas, portrait, place, width, height } of batch.slice(0, n)) {
+        [canvas.width, canvas.height] = [width, height];
+        canvas.getContext("2d").drawImage(renderer.canvas, ...place, width, height, 0, 0, width, height);
+        canvas.dataset.drawn = portrait.version;
+      }
+      // The others again, before those that came later.
+      const later = [...this.waiting];
+      this.waiting = new Map([...batch.slice(n).map((b) => [b.canvas, b.portrait.name]), ...later]);
+    }
+    this.running = this.waiting.size > 0;
+    if (this.running) requestAnimationFrame(() => this.frame());
+    else this.app.thumbnailsDrawn();
+  }
+
+  /** Pixels of a picture. */
+  size(canvas) {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    return {
+      width: Math.max(Math.round(canvas.clientWidth * ratio), 16),
+      height: Math.max(Math.round(canvas.clientHeight * ratio), 16),
+    };
+  }
+
+  draw(entry, place) {
+    const { renderer, app } = this;
+    const { portrait, width, height } = entry;
+    entry.place = place;
+    const mesh = new Mesh(portrait, app.up);
+    const view = new View();
+    view.box = [...place, width, height];
+    view.fit(mesh);
+    const uploaded = renderer.upload(mesh);
+    renderer.update(uploaded, "colour", faceColours(mesh.nFaces, (f) => app.shownColour(mesh.labels[f])));
+    renderer.draw(uploaded, view, { lines: 0.9 });
+    renderer.remove(uploaded);
+  }
+}
+
+/** The grid of cards. */
+class Gallery {
+  constructor(app) {
+    this.app = app;
+    this.root = $("gallery");
+    this.cards = new Map();
+    const near = { root: this.root, rootMargin: "150px" };
+    this.sight = new IntersectionObserver((entries) => this.seen(entries), near);
+    this.root.addEventListener("click", (event) => {
+      const card = event.target.closest(".card");
+      if (card) app.open(card.dataset.name);
+    });
+  }
+
+  /** Shows these shapes in this order. */
+  show(shapes) {
+    const wanted = new Set(shapes.map((s) => s.name));
+    for (const [name, card] of this.cards)
+      if (!wanted.has(name)) {
+        this.sight.unobserve(card);
+        card.remove();
+        this.cards.delete(name);
+      }
+    const cards = shapes.map((shape) => {
+      const card = this.cards.get(shape.name) ?? this.card(shape);
+      this.describe(card, shape);
+      return card;
+    });
+    if (cards.some((card, i) => this.root.children[i] !== card)) this.root.replaceChildren(...cards);
+  }
+
+  card(shape) {
+    const card = make(
+      "button",
+      { className: "card", "data-name": shape.name },
+      make("canvas", { "aria-hidden": "true" }),
+      make("span", { className: "foot" }, make("span", { className: "name" }), make("span", { className: "mark" })),
+    );
+    this.cards.set(shape.name, card);
+    this.sight.observe(card);
+    return card;
+  }
+
+  describe(card, shape) {
+    const [name, mark] = card.querySelectorAll(".foot span");
+    name.textContent = shape.name;
+    card.title = `${shape.name}: ${shape.n_polygons} faces, ${shape.parts.length} parts`;
+    const doubt = certainty(shape) < 0.6;
+    mark.textContent = shape.stale ? "waiting" : doubt ? "unsure" : "";
+    mark.classList.toggle("doubt", doubt && !shape.stale);
+    card.setAttribute("aria-current", String(this.app.selected === shape.name));
+  }
+
+  seen(entries) {
+    for (const { target, isIntersecting } of entries) {
+      target.inSight = isIntersecting;
+      const canvas = target.firstChild;
+      if (isIntersecting) this.draw(target.dataset.name);
+      // Thousands of pictures would not fit into memory.
+      else if (canvas.dataset.drawn && this.cards.size > 800) {
+        [canvas.width, canvas.height] = [1, 1];
+        delete canvas.dataset.drawn;
+      }
+    }
+  }
+
+  /** Draws a shape's picture if it is in sight and not drawn as it is. */
+  draw(name, again = false) {
+    const card = this.cards.get(name);
+    const portrait = this.app.portraits.get(name);
+    if (!card?.inSight || !portrait) {
+      if (card && again) delete card.firstChild.dataset.drawn;
+      return;
+    }
+    const size = `${card.clientWidth} ${portrait.version}`;
+    if (!again && card.drawnAs === size && card.firstChild.dataset.drawn) return;
+    card.drawnAs = size;
+    this.app.thumbnails.ask(card.firstChild, name);
+  }
+
+  /** Draws all that are in sight again. */
+  redraw() {
+    for (const name of this.cards.keys()) this.draw(name, true);
+  }
+
+  select(name) {
+    for (const card of this.cards.values())
+      card.setAttribute("aria-current", String(card.dataset.name === name));
+    this.cards.get(name)?.scrollIntoView({ block: "nearest" });
+  }
+}
+
+/** Mean probability of a shape's labels. */
+function certainty(shape) {
+  return shape.parts.reduce((sum, p) => sum + p.area_share * p.confidence, 0);
+}

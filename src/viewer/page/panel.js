@@ -1,0 +1,281 @@
+// What is known of the shape on the stage, and what is chosen for it.
+
+class Panel {
+  constructor(app) {
+    this.app = app;
+    this.root = $("panel");
+  }
+
+  /** Everything about a shape. */
+  async show(name) {
+    const { app } = this;
+    const shape = app.shape(name);
+    if (!shape) return;
+    const ticket = (this.ticket = (this.ticket ?? 0) + 1);
+    const near = make("div", { className: "near" });
+    const log = make("ol", { className: "log" });
+    this.mapBox = make("div");
+    const state = shape.stale ? ", waits to be relabelled" : "";
+    this.root.replaceChildren(
+      make("h2", {}, name),
+      make("div", { className: "facts" },
+        `${shape.n_polygons.toLocaleString("en")} faces · labels version ${shape.version}${state}`),
+      this.mapBox,
+      make("h3", {}, `Parts (${shape.parts.length})`),
+      this.parts(shape),
+      make("h3", {}, "Most alike"),
+      near,
+      make("h3", {}, "History"),
+      log,
+      make("h3", {}, "Mesh"),
+      make("div", { className: "facts" }, meshText(shape)),
+    );
+    const [neighbours, events] = await Promise.all([
+      app.nearest(name).catch(() => []),
+      app.events().catch(() => []),
+    ]);
+    if (ticket !== this.ticket) return;
+    this.neighbours(near, neighbours);
+    this.history(log, name, events);
+  }
+
+  parts(shape) {
+    const { app } = this;
+    const list = make("div", { className: "parts" });
+    let pressed = null;
+    const largest = Math.max(...shape.parts.map((p) => p.area_share), 1e-9);
+    shape.parts.forEach((part, i) => {
+      const colour = app.colour(part.label);
+      const fill = make("span", { className: "fill" });
+      fill.style.width = `${(100 * part.area_share) / largest}%`;
+      fill.style.background = css(colour);
+      const row = make("button", { className: "part", "aria-pressed": "false", "data-label": part.label },
+        swatch(colour),
+        make("span", {}, app.labelName(part.label)),
+        make("span", { className: "share" }, percent(part.area_share)),
+        make("span", { className: "track" }, fill),
+      );
+      row.title = `part ${i}, mean probability ${part.confidence.toFixed(2)}`;
+      const highlight = { part: i, label: part.label, share: part.area_share };
+      row.onmouseenter = () => app.stage.setHighlight(highlight);
+      row.onmouseleave = () => app.stage.setHighlight(pressed?.highlight ?? null);
+      row.onclick = () => {
+        pressed?.row.setAttribute("aria-pressed", "false");
+        pressed = pressed?.row === row ? null : { row, highlight };
+        pressed?.row.setAttribute("aria-pressed", "true");
+        app.stage.setHighlight(pressed?.highlight ?? null);
+      };
+      list.append(row);
+    });
+    return list;
+  }
+
+  neighbours(box, neighbours) {
+    if (neighbours.length === 0) box.replaceWith(make("div", { className: "facts" }, "no other shape"));
+    for (const [name, distance] of neighbours) {
+      const canvas = make("canvas");
+      const button = make("button", { title: `${name}, distance ${distance.toFixed(3)}` }, canvas,
+        make("span", {}, name));
+      button.onclick = () => this.app.open(name);
+      box.append(button);
+      if (this.app.portraits.has(name)) this.app.thumbnails.ask(canvas, name);
+    }
+  }
+
+  /** What happened to the shape, and to the labels that all share; newest first. */
+  history(list, name, events) {
+    const { app } = this;
+    const lines = [];
+    for (const e of [...events].reverse()) {
+      const about = e.shape === name ? shapeEvent(e) : e.shape === undefined ? labelEvent(e, app) : null;
+      if (!about) continue;
+      const moves = (e.moves ?? []).filter((m) => m.area_share >= 0.002).slice(0, 6);
+      const items = moves.map((m) =>
+        make("span", { title: `${app.labelName(m.from)} to ${app.labelName(m.to)}` },
+          swatch(app.colour(m.from)), "→", swatch(app.colour(m.to)), percent(m.area_share)));
+      lines.push(make("li", { className: about.person ? "person" : "" }, about.text,
+        items.length ? make("div", { className: "moves" }, ...items) : null));
+      if (lines.length === 60) break;
+    }
+    list.replaceChildren(...lines);
+    if (lines.length === 0) list.append(make("li", {}, "nothing yet"));
+  }
+
+  /** What can be chosen in the mode of the stage. */
+  showControls() {
+    const { stage } = this.app;
+    const box = $("controls");
+    this.mapBox?.replaceChildren();
+    if (stage.mode === "eigen" && stage.functions)
+      box.replaceChildren(...slider("Eigenfunction", stage.eigen, stage.functions.eigenvalues.length, (value) => {
+        stage.eigen = value;
+        stage.refresh();
+      }, `${stage.eigen + 1}, λ = ${stage.functions.eigenvalues[stage.eigen].toPrecision(4)}`),
+      bar(DIVERGING), make("span", { className: "quiet" }, "− to +, lines of equal value"));
+    else if (stage.mode === "hks" && stage.functions)
+      box.replaceChildren(...slider("Time", stage.time, stage.functions.times.length, (value) => {
+        stage.time = value;
+        stage.refresh();
+      }, `t = ${stage.functions.times[stage.time].toPrecision(3)}`),
+      bar(SEQUENTIAL), make("span", { className: "quiet" }, "little to much heat left"));
+    else if (stage.mode === "map") this.mapControls(box);
+    else if (stage.mode === "correct") this.paintControls(box);
+    else
+      box.replaceChildren(make("span", { className: "quiet" },
+        "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over"));
+  }
+
+  mapControls(box) {
+    const { stage, source, selected } = this.app;
+    const from = make("select", { "aria-label": "Carried from" },
+      ...this.app.mapSources(selected).map((name) => make("option", { value: name }, name)));
+    from.value = stage.from ?? "";
+    from.onchange = () => {
+      stage.from = from.value;
+      stage.refresh();
+    };
+    const what = make("select", { "aria-label": "What is carried" },
+      make("option", { value: "labels" }, "labels"), make("option", { value: "place" }, "colours of places"));
+    what.value = stage.carried;
+    what.onchange = () => {
+      stage.carried = what.value;
+      stage.refresh();
+    };
+    box.replaceChildren(make("label", {}, "From", from), make("label", {}, "Carry", what),
+      make("span", { className: "quiet" }, source.live ? "" : "maps that are in this file"));
+    if (stage.map && stage.map.to === selected) this.heatMap(stage.map);
+  }
+
+  heatMap(map) {
+    const [rows, columns] = map.c_12.shape;
+    const canvas = make("canvas", { className: "heat", width: columns, height: rows,
+      title: `C, ${rows} × ${columns}: coefficients on ${map.from} to coefficients on ${map.to}` });
+    const values = numbers(map.c_12);
+    const largest = values.reduce((m, v) => Math.max(m, Math.abs(v)), 1e-9);
+    const pixels = new ImageData(columns, rows);
+    values.forEach((v, i) => {
+      const t = Math.sign(v) * Math.sqrt(Math.abs(v) / largest);
+      pixels.data.set([...shade(DIVERGING, 0.5 + t / 2), 255], 4 * i);
+    });
+    canvas.getContext("2d").putImageData(pixels, 0, 0);
+    canvas.style.aspectRatio = `${columns} / ${rows}`;
+    const q = map.quality;
+    const facts = q
+      ? [["area of the source that is hit", percent(q.coverage)],
+         ["off an isometry, ‖CᵀC − I‖/√k", q.orthogonality.toFixed(2)],
+         ["entries near zero", percent(q.near_zero)],
+         ["descriptor residual", q.descriptor_residual.toPrecision(3)]]
+      : [];
+    this.mapBox.replaceChildren(
+      make("h3", {}, "Functional map"), canvas,
+      make("div", { className: "quality" }, ...facts.flatMap(([k, v]) => [make("span", {}, k), make("b", {}, v)])));
+  }
+
+  paintControls(box) {
+    const { stage } = this.app;
+    const { brush } = stage;
+    const ids = this.app.labelsInUse().map((l) => l.id);
+    const fresh = Math.max(-1, ...this.app.labels.keys()) + 1;
+    brush.label ??= ids[0] ?? fresh;
+    const choose = (label) => {
+      brush.label = label;
+      this.paintControls(box);
+    };
+    const entry = (label, text) => {
+      const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label },
+        swatch(this.app.colour(label)), text);
+      button.onclick = () => choose(label);
+      return button;
+    };
+    const tool = make("select", { "aria-label": "Tool" },
+      make("option", { value: "brush" }, "Brush"), make("option", { value: "part" }, "Whole part"));
+    tool.value = brush.tool;
+    tool.onchange = () => {
+      brush.tool = tool.value;
+      size.disabled = brush.tool === "part";
+    };
+    const size = make("input", { type: "range", min: 0.02, max: 0.5, step: 0.01, value: brush.size, disabled: brush.tool === "part", "aria-label": "Size of the brush" });
+    size.oninput = () => (brush.size = Number(size.value));
+    size.style.width = "90px";
+    this.apply = make("button", { className: "primary", id: "apply" }, "Apply");
+    this.apply.onclick = () => this.app.correct();
+    this.discard = make("button", { id: "discard" }, "Discard");
+    this.discard.onclick = () => stage.discard();
+    this.amount = make("span", { className: "quiet" });
+    box.replaceChildren(tool, size,
+      make("div", { className: "palette" }, ...ids.map((id) => entry(id, this.app.labelName(id))), entry(fresh, "new label")),
+      make("span", { className: "ends" }, this.amount, this.discard, this.apply));
+    $("scene").classList.add("painting");
+    this.paintedChanged();
+  }
+
+  paintedChanged() {
+    const n = this.app.stage.painted.size;
+    if (!this.apply) return;
+    this.apply.disabled = this.discard.disabled = n === 0;
+    this.amount.textContent = n ? `${n} faces painted` : "paint on the shape, drag beside it to turn";
+  }
+}
+
+function slider(text, value, count, changed, shown) {
+  const output = make("output", {}, shown);
+  const input = make("input", { type: "range", min: 0, max: count - 1, step: 1 });
+  input.value = value;
+  input.setAttribute("aria-label", text);
+  input.oninput = () => changed(Number(input.value));
+  const label = make("label", {}, text, input);
+  // The slider stays the one that is being moved.
+  const now = $("controls").querySelector("input[type=range]");
+  if (now && now.getAttribute("aria-label") === text && document.activeElement === now) {
+    now.oninput = input.oninput;
+    return [now.parentElement, output];
+  }
+  return [label, output];
+}
+
+function bar(scale) {
+  const element = make("span", { className: "scale" });
+  element.style.background = `linear-gradient(90deg, ${scale.map(css).join(", ")})`;
+  return element;
+}
+
+const CAUSES = {
+  reclustering: "the collection was clustered anew",
+  correction: "corrected by a person",
+  carrying: "a correction was carried here",
+  merge: "labels were merged",
+  split: "a label was split",
+  undo: "a change was undone",
+};
+
+function shapeEvent(e) {
+  switch (e.kind) {
+    case "shape_added": return { text: `added, labels version ${e.version}` };
+    case "labels_changed":
+      return { text: `version ${e.version}: ${CAUSES[e.cause] ?? e.cause}`, person: e.cause === "correction" };
+    case "corrected":
+      return { text: `${e.n_faces} faces (${percent(e.area_share)}) labelled by hand`, person: true };
+    default: return null;
+  }
+}
+
+function labelEvent(e, app) {
+  const name = (id) => app.labelName(id);
+  switch (e.kind) {
+    case "label_named": return { text: `label ${e.label} named “${e.name}”`, person: true };
+    case "label_merged": return { text: `${name(e.from)} merged into ${name(e.into)}`, person: true };
+    case "label_split": return { text: `${name(e.from)} split`, person: true };
+    case "undone": return { text: `${e.change} undone`, person: true };
+    default: return null;
+  }
+}
+
+function meshText(shape) {
+  const r = shape.report ?? {};
+  const found = [
+    [r.n_components > 1 && r.n_components, "components"], [r.n_welded_vertices, "vertices welded"],
+    [r.n_degenerate_triangles, "degenerate triangles dropped"], [r.n_duplicate_triangles, "duplicate triangles dropped"],
+    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"], [r.n_bridges, "virtual edges"],
+  ].filter(([n]) => n > 0).map(([n, what]) => `${n} ${what}`);
+  return `${found.join(", ") || "clean"}; worked on with ${r.n_proxy_faces} faces`;
+}

@@ -1,0 +1,417 @@
+// One shape, large: turned, coloured by what was chosen, corrected.
+
+/** Triangles up to which the mesh that was sent is shown instead of the proxy. */
+const MAX_SURFACE = 120_000;
+
+class Stage {
+  constructor(app) {
+    this.app = app;
+    this.canvas = $("scene");
+    this.view = new View();
+    this.mode = "labels";
+    this.eigen = 0;
+    this.time = null;
+    this.carried = "labels";
+    this.brush = { label: null, size: 0.1, tool: "brush" };
+    this.painted = new Map();
+    this.listen();
+  }
+
+  get renderer() {
+    return (this._renderer ??= new Renderer(this.canvas));
+  }
+
+  /** Shows a shape from the start; resolves when all that the mode needs is drawn. */
+  async show(name) {
+    this.name = name;
+    this.painted.clear();
+    this.highlight = null;
+    this.fitted = false;
+    await this.refresh();
+  }
+
+  async setMode(mode) {
+    this.mode = mode;
+    this.highlight = null;
+    await this.refresh();
+  }
+
+  close() {
+    this.name = null;
+    this.drop();
+  }
+
+  drop() {
+    for (const scene of this.scenes ?? []) this.renderer.remove(scene.uploaded);
+    this.scenes = [];
+  }
+
+  notice(text) {
+    $("notice").textContent = text;
+    $("notice").hidden = !text;
+  }
+
+  /** Fetches and shows what belongs to shape and mode; a later call makes an earlier one void. */
+  async refresh() {
+    const ticket = (this.ticket = (this.ticket ?? 0) + 1);
+    const { app, name, mode } = this;
+    const portrait = app.portraits.get(name);
+    if (!portrait) {
+      this.notice("This shape is not loaded yet.");
+      return;
+    }
+    this.notice("");
+    $("loading").hidden = false;
+    try {
+      const scenes = await this.build(mode, name, portrait, ticket);
+      if (ticket === this.ticket) this.present(scenes);
+    } catch (error) {
+      if (ticket !== this.ticket) return;
+      this.present([{ mesh: new Mesh(portrait, app.up), caption: name }]);
+      this.notice(error.message);
+    } finally {
+      if (ticket === this.ticket) {
+        $("loading").hidden = true;
+        app.panel.showControls();
+        $("stage").dataset.shown = `${name} ${mode}`;
+      }
+    }
+  }
+
+  async build(mode, name, portrait, ticket) {
+    const { app } = this;
+    const proxy = new Mesh(portrait, app.up);
+    if (mode === "labels" || mode === "correct") {
+      const info = app.shape(name);
+      const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
+      if (!fine && mode === "correct")
+        throw new Error(`With ${info.n_polygons} faces this shape is corrected with “coseg correct”.`);
+      if (!fine) return [{ mesh: proxy, caption: name, note: this.resolution(portrait, info) }];
+      // The proxy at once, the mesh that was sent as soon as it is there.
+      if (!this.scenes?.some((s) => s.mesh.portrait.name === name)) this.present([{ mesh: proxy, caption: name }]);
+      const surface = await app.surface(name);
+      if (ticket !== this.ticket) return [];
+      return [{ mesh: new Mesh(surface, app.up), caption: name, note: `${info.n_polygons} faces, as sent` }];
+    }
+    if (mode === "map") return this.buildMap(name, proxy);
+    const functions = await app.functions(name);
+    this.functions = functions;
+    const scene = { mesh: proxy, caption: name };
+    if (mode === "eigen") {
+      this.eigen = Math.min(this.eigen, functions.eigenvalues.length - 1);
+      const values = column(functions.eigenvectors, this.eigen);
+      const largest = values.reduce((m, v) => Math.max(m, Math.abs(v)), 1e-12);
+      scene.values = values.map((v) => v / largest);
+      scene.colours = vertexColours(proxy, (v) => shade(DIVERGING, 0.5 + scene.values[v] / 2));
+      scene.contours = 5;
+      scene.note = `eigenfunction ${this.eigen + 1}`;
+    } else {
+      this.time = Math.min(this.time ?? Math.floor(functions.times.length / 3), functions.times.length - 1);
+      const values = column(functions.hks, this.time);
+      const sorted = Float32Array.from(values).sort();
+      const [low, high] = [sorted[0], sorted[Math.floor(0.98 * (sorted.length - 1))]];
+      scene.values = values.map((v) => (v - low) / (high - low || 1));
+      scene.colours = vertexColours(proxy, (v) => shade(SEQUENTIAL, scene.values[v]));
+      scene.note = `heat kernel signature at t = ${functions.times[this.time].toPrecision(3)}`;
+    }
+    return [scene];
+  }
+
+  async buildMap(name, proxy) {
+    const { app } = this;
+    const sources = app.mapSources(name);
+    if (sources.length === 0)
+      throw new Error(
+        app.source.live
+          ? "A map needs a second shape."
+          : "No map to this shape is in this file. Write it with --maps N to have more.",
+      );
+    if (!sources.includes(this.from)) this.from = sources[0];
+    const map = (this.map = await app.map(this.from, name));
+    const source = new Mesh(app.portraits.get(this.from), app.up);
+    const colour = this.carried === "labels" ? labelColours(source, app) : placeColours(source);
+    const back = map.p2p_21.data;
+    return [
+      { mesh: source, caption: this.from, note: "from", colours: vertexColours(source, colour), plain: true },
+      { mesh: proxy, caption: name, note: "carried to", colours: vertexColours(proxy, (v) => colour(back[v])), plain: true },
+    ];
+  }
+
+  resolution(portrait, info) {
+    const shown = portrait.labels.data.length;
+    return shown === info.n_polygons ? `${shown} faces` : `working resolution: ${shown} of ${info.n_polygons} faces`;
+  }
+
+  /** Takes over what is to be drawn. */
+  present(scenes) {
+    if (scenes.length === 0) return;
+    this.drop();
+    this.scenes = scenes;
+    for (const scene of scenes) {
+      scene.uploaded = this.renderer.upload(scene.mesh);
+      if (scene.values)
+        this.renderer.update(scene.uploaded, "value", Float32Array.from(scene.mesh.faces, (v) => scene.values[v]));
+    }
+    this.colour();
+    $("captions").replaceChildren(
+      ...scenes.map((s) => make("div", {}, s.caption, s.note ? make("small", {}, s.note) : null)),
+    );
+    this.resize();
+    if (!this.fitted) this.fit();
+    this.draw();
+  }
+
+  fit() {
+    this.fitted = true;
+    const turned = new View();
+    Object.assign(this.view, { yaw: turned.yaw, pitch: turned.pitch });
+    this.view.box = [0, 0, this.canvas.width / this.scenes.length, this.canvas.height];
+    this.view.fit(this.scenes.at(-1).mesh);
+    this.view.zoom *= 0.88;
+    this.view.pan = this.view.pan.map((p) => p * 0.88);
+  }
+
+  /** Label of each face as painted so far. */
+  paintedLabels(mesh) {
+    if (this.painted.size === 0 || !mesh.polygons) return mesh.labels;
+    return mesh.labels.map((label, f) => this.painted.get(mesh.polygons[f]) ?? label);
+  }
+
+  colour() {
+    const { app, renderer, highlight } = this;
+    for (const { mesh, uploaded, colours, plain, values } of this.scenes) {
+      if (colours) {
+        renderer.update(uploaded, "colour", colours);
+        if (plain || values) renderer.update(uploaded, "border", new Uint8Array(4 * uploaded.nCorners).fill(255));
+        continue;
+      }
+      const labels = this.paintedLabels(mesh);
+      const dim = (c) => c.map((x) => 0.2 * x + 0.8 * 178);
+      const lit = this.highlighted(mesh, highlight);
+      const of = (f) => {
+        const c = app.shownColour(labels[f]);
+        return !lit || lit(f) ? c : dim(c);
+      };
+      renderer.update(uploaded, "colour", faceColours(mesh.nFaces, of));
+      renderer.update(uploaded, "border", mesh.borders(labels));
+    }
+  }
+
+  /** Which faces of a mesh a highlighted part or label covers. */
+  highlighted(mesh, highlight) {
+    if (!highlight) return null;
+    if (mesh.parts && highlight.part !== undefined) return (f) => mesh.parts[f] === highlight.part;
+    if (highlight.part === undefined) return (f) => mesh.labels[f] === highlight.label;
+    // The mesh that was sent has no parts of its own: pieces of the label, the one of about that share of the area.
+    const pieces = mesh.pieces ?? (mesh.pieces = piecesOf(mesh));
+    let best = null;
+    for (const piece of pieces)
+      if (piece.label === highlight.label) {
+        const off = Math.abs(piece.share - highlight.share);
+        if (!best || off < best.off) best = { off, piece };
+      }
+    const faces = best?.piece.faces;
+    return faces ? (f) => faces.has(f) : () => false;
+  }
+
+  setHighlight(highlight) {
+    this.highlight = highlight;
+    if (!this.scenes?.length || this.mode === "map") return;
+    this.colour();
+    this.draw();
+  }
+
+  resize() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const width = Math.max(Math.round(this.canvas.clientWidth * ratio), 1);
+    const height = Math.max(Math.round(this.canvas.clientHeight * ratio), 1);
+    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
+  }
+
+  draw() {
+    if (this.drawing) return;
+    this.drawing = requestAnimationFrame(() => {
+      this.drawing = null;
+      if (!this.scenes?.length) return;
+      this.resize();
+      this.renderer.clear();
+      const width = this.canvas.width / this.scenes.length;
+      this.scenes.forEach(({ uploaded, contours, values, plain }, i) => {
+        this.view.box = [Math.round(i * width), 0, Math.round(width), this.canvas.height];
+        this.renderer.draw(uploaded, this.view, { contours: contours ?? 0, lines: values || plain ? 0 : 1.4 });
+      });
+    });
+  }
+
+  /** What is at a place of the page. */
+  pick(event) {
+    if (!this.scenes?.length) return null;
+    const box = this.canvas.getBoundingClientRect();
+    const ratio = this.canvas.width / box.width;
+    const x = (event.clientX - box.left) * ratio;
+    const y = (event.clientY - box.top) * ratio;
+    const width = this.canvas.width / this.scenes.length;
+    const at = Math.min(Math.floor(x / width), this.scenes.length - 1);
+    const scene = this.scenes[at];
+    this.view.box = [at * width, 0, width, this.canvas.height];
+    const found = scene.mesh.pick(this.view, x - at * width, y);
+    return found && { ...found, scene };
+  }
+
+  listen() {
+    const { canvas, view } = this;
+    let drag = null;
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      const shift = event.shiftKey || event.button === 2;
+      const paint = this.mode === "correct" && !shift && !event.altKey && this.paint(event);
+      drag = { x: event.clientX, y: event.clientY, shift, paint };
+      if (!paint) canvas.classList.add("turning");
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      if (!drag) return this.hover(event);
+      if (drag.paint) return void this.paint(event);
+      const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
+      [drag.x, drag.y] = [event.clientX, event.clientY];
+      if (drag.shift) {
+        view.pan[0] += (2 * dx * this.scenes.length) / canvas.clientWidth;
+        view.pan[1] -= (2 * dy) / canvas.clientHeight;
+      } else {
+        view.yaw -= dx * 0.009;
+        view.pitch = Math.min(Math.max(view.pitch + dy * 0.009, -1.5), 1.5);
+      }
+      this.draw();
+    });
+    const end = () => {
+      drag = null;
+      canvas.classList.remove("turning");
+    };
+    canvas.addEventListener("pointerup", end);
+    canvas.addEventListener("pointercancel", end);
+    canvas.addEventListener("pointerleave", () => ($("hint").hidden = true));
+    canvas.addEventListener("dblclick", () => {
+      if (this.mode === "correct" || !this.scenes?.length) return;
+      this.fit();
+      this.draw();
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      const factor = Math.exp(-event.deltaY * 0.0012);
+      view.zoom = Math.min(Math.max(view.zoom * factor, 0.2), 30);
+      view.pan = view.pan.map((p) => p * factor);
+      this.draw();
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => {
+      const step = { a: [-0.15, 0], d: [0.15, 0], w: [0, 0.1], s: [0, -0.1] }[event.key];
+      if (!step) return;
+      view.yaw += step[0];
+      view.pitch = Math.min(Math.max(view.pitch + step[1], -1.5), 1.5);
+      this.draw();
+    });
+    new ResizeObserver(() => this.draw()).observe(canvas);
+  }
+
+  hover(event) {
+    const hint = $("hint");
+    const shown = this.scenes?.[0]?.mesh;
+    const found = shown && shown.nFaces <= 30_000 && this.pick(event);
+    hint.hidden = !found;
+    if (!found) return;
+    const { mesh, values } = found.scene;
+    const box = this.canvas.getBoundingClientRect();
+    hint.style.left = `${Math.min(event.clientX - box.left + 14, box.width - 150)}px`;
+    hint.style.top = `${event.clientY - box.top + 14}px`;
+    if (values) {
+      const value = values[mesh.faces[3 * found.face]];
+      hint.replaceChildren(value.toFixed(2));
+    } else {
+      const label = this.paintedLabels(mesh)[found.face];
+      hint.replaceChildren(swatch(this.app.colour(label)), this.app.labelName(label));
+    }
+  }
+
+  /** Paints where the pointer is; false if it is not on the shape, or nothing is chosen to paint with. */
+  paint(event) {
+    const { brush } = this;
+    const found = brush.label !== null && this.pick(event);
+    if (!found) return false;
+    const { mesh } = found.scene;
+    let faces;
+    if (brush.tool === "part") {
+      const labels = this.paintedLabels(mesh);
+      const label = labels[found.face];
+      faces = mesh.flood(found.face, (f) => labels[f] === label);
+    } else {
+      const reach = brush.size / Math.max(this.view.zoom, 0.5);
+      const near = (f) => Math.hypot(...mesh.centre(f).map((x, i) => x - found.point[i])) < reach;
+      faces = mesh.flood(found.face, near);
+    }
+    for (const f of faces) this.painted.set(mesh.polygons[f], brush.label);
+    this.colour();
+    this.draw();
+    this.app.panel.paintedChanged();
+    return true;
+  }
+
+  discard() {
+    this.painted.clear();
+    this.colour();
+    this.draw();
+    this.app.panel.paintedChanged();
+  }
+
+  /** Runs of polygons with the same painted label: first, count, label. */
+  runs() {
+    const runs = [];
+    for (const polygon of [...this.painted.keys()].sort((a, b) => a - b)) {
+      const label = this.painted.get(polygon);
+      const last = runs.at(-1);
+      if (last && last[0] + last[1] === polygon && last[2] === label) last[1]++;
+      else runs.push([polygon, 1, label]);
+    }
+    return runs;
+  }
+}
+
+/** Connected pieces of one label, with their shares of the area. */
+function piecesOf(mesh) {
+  const { nFaces, labels } = mesh;
+  const normals = mesh.faceNormals;
+  const area = (f) => Math.hypot(normals[3 * f], normals[3 * f + 1], normals[3 * f + 2]);
+  const seen = new Uint8Array(nFaces);
+  const pieces = [];
+  let all = 0;
+  for (let f = 0; f < nFaces; f++) {
+    all += area(f);
+    if (seen[f]) continue;
+    const faces = new Set(mesh.flood(f, (g) => labels[g] === labels[f]));
+    let sum = 0;
+    for (const g of faces) {
+      seen[g] = 1;
+      sum += area(g);
+    }
+    pieces.push({ label: labels[f], share: sum, faces });
+  }
+  for (const piece of pieces) piece.share /= all || 1;
+  return pieces;
+}
+
+/** Colour of each vertex: that of the label around it. */
+function labelColours(mesh, app) {
+  const of = new Int32Array(mesh.positions.length / 3).fill(-1);
+  for (let c = 0; c < mesh.faces.length; c++) of[mesh.faces[c]] = mesh.labels[(c / 3) | 0];
+  return (v) => app.colour(of[v]);
+}
+
+/** Colour of each vertex by its place, so that one sees where each goes. */
+function placeColours(mesh) {
+  const p = mesh.positions;
+  const low = [1, 1, 1];
+  const high = [-1, -1, -1];
+  for (let i = 0; i < p.length; i++) {
+    low[i % 3] = Math.min(low[i % 3], p[i]);
+    high[i % 3] = Math.max(high[i % 3], p[i]);
+  }
+  return (v) => [0, 1, 2].map((i) => 40 + (205 * (p[3 * v + i] - low[i])) / (high[i] - low[i] || 1));
+}

@@ -1,0 +1,308 @@
+//! The HTTP endpoint, and the commands that show: `view`, `top`, completions and manual page.
+
+use crate::harness::{Daemon, Home, add, coseg, json, skittle, stdout};
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+
+/// A daemon with an HTTP endpoint on a free port.
+fn served(home: &Home, env: &[(&str, &str)]) -> (Daemon, SocketAddr) {
+    let mut daemon = home.start_with(&["--http", "127.0.0.1:0"], env);
+    let line = daemon.await_line("viewer and metrics at http://");
+    let (_, rest) = line.split_once("http://").unwrap();
+    (daemon, rest.trim_end_matches('/').parse().unwrap())
+}
+
+/// Status, headers and body of an answer.
+fn exchange(
+    address: SocketAddr,
+    request: &str,
+    headers: &str,
+    body: &str,
+) -> (u16, String, Vec<u8>) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    let n = body.len();
+    write!(
+        stream,
+        "{request} HTTP/1.1\r\nconnection: close\r\ncontent-length: {n}\r\n{headers}\r\n{body}"
+    )
+    .unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let at = answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+    let head = String::from_utf8(answer[..at].to_vec()).unwrap();
+    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+    (status, head.to_lowercase(), answer[at + 4..].to_vec())
+}
+
+fn get(address: SocketAddr, path: &str) -> (u16, String) {
+    let host = format!("host: {address}\r\n");
+    let (status, _, body) = exchange(address, &format!("GET {path}"), &host, "");
+    (status, String::from_utf8_lossy(&body).into_owned())
+}
+
+fn fill(daemon: &Daemon) {
+    let texts: Vec<String> = (0..2).map(skittle).collect();
+    add(
+        &mut daemon.client(),
+        "skittles",
+        &[("a", &texts[0]), ("b", &texts[1])],
+    );
+}
+
+#[test]
+fn health_and_metrics_are_told() {
+    let home = Home::new();
+    let (daemon, address) = served(&home, &[]);
+    assert_eq!(get(address, "/healthz"), (200, "alive\n".to_owned()));
+    assert_eq!(get(address, "/readyz"), (200, "ready\n".to_owned()));
+    fill(&daemon);
+    let (status, text) = get(address, "/metrics");
+    assert_eq!(status, 200);
+    for line in [
+        "coseg_shapes 2",
+        "coseg_collections 1",
+        "coseg_shapes_queued 0",
+        "coseg_shapes_finished_total{outcome=\"added\"} 2",
+        "coseg_stage_duration_seconds_count{stage=\"spectrum\"} 2",
+        "coseg_http_responses_total{path=\"/readyz\",status=\"200\"} 1",
+        "# EOF",
+    ] {
+        assert!(text.lines().any(|l| l == line), "no {line} in\n{text}");
+    }
+    // The document lists every metric, and no other.
+    let document = include_str!("../../docs/metrics.md");
+    for line in text.lines().filter_map(|l| l.strip_prefix("# TYPE ")) {
+        let name = line.split(' ').next().unwrap();
+        assert!(
+            document.contains(name),
+            "docs/metrics.md does not have {name}"
+        );
+    }
+    let dashboard = include_str!("../../config/grafana/dashboard.json");
+    let dashboard: serde_json::Value = serde_json::from_str(dashboard).unwrap();
+    let panels = dashboard["panels"].as_array().unwrap();
+    let asked = panels.iter().flat_map(|p| p["targets"].as_array().unwrap());
+    let is_name = |c: char| c.is_alphanumeric() || c == '_';
+    for query in asked.map(|t| t["expr"].as_str().unwrap()) {
+        for name in query
+            .split(|c| !is_name(c))
+            .filter(|w| w.starts_with("coseg_"))
+        {
+            // Counters of what did not happen have no line yet.
+            let known = text.contains(name) || name == "coseg_requests_refused_total";
+            assert!(known, "the dashboard asks for {name}");
+        }
+    }
+}
+
+#[test]
+fn only_the_page_itself_may_change_anything() {
+    let home = Home::new();
+    let (daemon, address) = served(&home, &[]);
+    fill(&daemon);
+    let host = format!("host: {address}\r\n");
+    let name = |headers: &str| {
+        let body = r#"{"collection":"skittles","label":0,"name":"body"}"#;
+        let (status, _, body) = exchange(address, "POST /api/name", headers, body);
+        (status, String::from_utf8(body).unwrap())
+    };
+    let own = format!("{host}x-coseg: 1\r\norigin: http://{address}\r\n");
+    for headers in [
+        host.clone(),
+        format!("{host}x-coseg: 1\r\norigin: http://example.org\r\n"),
+        format!("{host}x-coseg: 1\r\norigin: null:\r\n"),
+        own.replace(&host, "host: example.org\r\n"),
+        own.replace(&host, ""),
+    ] {
+        let (status, said) = name(&headers);
+        assert!(status == 403 || status == 400, "{headers}: {status} {said}");
+    }
+    let shown = || json(&home.coseg(&["show", "-c", "skittles", "--json"]), 0);
+    assert!(shown()["labels"][0]["name"].is_null());
+    assert_eq!(name(&own).0, 200);
+    assert_eq!(shown()["labels"][0]["name"], "body");
+    // What the daemon refuses has its reason.
+    let wrong = r#"{"collection":"skittles","label":99,"name":"x"}"#;
+    let (status, _, body) = exchange(address, "POST /api/name", &own, wrong);
+    let body: serde_json::Value = serde_json::from_slice(&body).unwrap();
+    assert_eq!(
+        (status, &body["error"]["reason"]),
+        (404, &"NO_LABEL".into())
+    );
+    assert_eq!(exchange(address, "POST /api/name", &own, "{").0, 400);
+    assert_eq!(exchange(address, "POST /api/drain", &own, "{}").0, 404);
+    assert_eq!(exchange(address, "DELETE /", &host, "").0, 405);
+    // A page of another site that was made to point here sees nothing.
+    assert_eq!(
+        exchange(address, "GET /api/library", "host: example.org\r\n", "").0,
+        403
+    );
+}
+
+#[test]
+fn the_viewer_is_served_with_all_it_needs() {
+    let home = Home::new();
+    let (daemon, address) = served(&home, &[("COSEG__HTTP__EDIT", "false")]);
+    fill(&daemon);
+    let host = format!("host: {address}\r\n");
+    let (status, head, page) = exchange(address, "GET /", &host, "");
+    assert_eq!(status, 200);
+    assert!(
+        head.contains("content-security-policy: default-src 'none'"),
+        "{head}"
+    );
+    let page = String::from_utf8(page).unwrap();
+    for file in ["viewer.css", "viewer.js"] {
+        assert!(page.contains(file) && get(address, &format!("/{file}")).0 == 200);
+    }
+    let (_, library) = get(address, "/api/library");
+    let library: serde_json::Value = serde_json::from_str(&library).unwrap();
+    assert_eq!(library["edit"], false);
+    assert_eq!(library["collections"][0]["name"], "skittles");
+    let (_, found) = get(address, "/api/collection?collection=skittles");
+    let found: serde_json::Value = serde_json::from_str(&found).unwrap();
+    assert_eq!(found["shapes"][1]["name"], "b");
+    for (path, kind) in [
+        ("portraits?collection=skittles&after=1&limit=9", "proxy"),
+        (
+            "portraits?collection=skittles&shape=b&detail=surface",
+            "surface",
+        ),
+        (
+            "portraits?collection=skittles&shape=b&detail=functions",
+            "functions",
+        ),
+    ] {
+        let (status, _, pack) = exchange(address, &format!("GET /api/{path}"), &host, "");
+        assert_eq!(status, 200, "{path}");
+        let n = u32::from_le_bytes(pack[..4].try_into().unwrap()) as usize;
+        let header: serde_json::Value = serde_json::from_slice(&pack[4..4 + n]).unwrap();
+        let shapes = header["shapes"].as_array().unwrap();
+        assert_eq!(
+            (shapes.len(), &shapes[0]["name"]),
+            (1, &"b".into()),
+            "{path}"
+        );
+        assert_eq!(shapes[0]["kind"], kind);
+    }
+    let map = "/api/map?collection=skittles&from=a&to=b";
+    assert_eq!(get(address, map).0, 200);
+    assert_eq!(get(address, "/api/map?collection=skittles&from=a").0, 400);
+    assert_eq!(get(address, "/api/nearest?collection=none&shape=a").0, 404);
+    let own = format!("{host}x-coseg: 1\r\n");
+    assert_eq!(
+        exchange(
+            address,
+            "POST /api/undo",
+            &own,
+            r#"{"collection":"skittles"}"#
+        )
+        .0,
+        403
+    );
+}
+
+#[test]
+fn a_collection_becomes_one_page() {
+    let home = Home::new();
+    let daemon = home.start();
+    fill(&daemon);
+    let file = home.path("page.html").display().to_string();
+    let told = json(&home.coseg(&["view", "-o", &file, "--json"]), 0);
+    let page = std::fs::read_to_string(&file).unwrap();
+    assert_eq!(told["n_shapes"], 2);
+    assert_eq!(told["n_bytes"], page.len());
+    assert_eq!(page.matches("data-kind=\"functions\"").count(), 2);
+    assert_eq!(
+        page.matches("data-kind=\"map\"").count(),
+        told["n_maps"].as_u64().unwrap() as usize
+    );
+    let less = [
+        "view",
+        "skittles",
+        "-o",
+        &file,
+        "--max",
+        "1",
+        "--functions",
+        "0",
+        "--maps",
+        "0",
+        "--json",
+    ];
+    let told = json(&home.coseg(&less), 0);
+    assert_eq!(
+        (&told["n_shapes"], &told["n_left_out"]),
+        (&1.into(), &1.into())
+    );
+    assert!((told["n_bytes"].as_u64().unwrap() as usize) < page.len());
+    // The same library gives the same page.
+    let text = |name: &str| {
+        let path = home.path(name).display().to_string();
+        stdout(&home.coseg(&["view", "-o", &path]), 0);
+        std::fs::read(&path).unwrap()
+    };
+    assert_eq!(text("one.html"), text("two.html"));
+}
+
+#[test]
+fn top_follows_the_daemon() {
+    let home = Home::new();
+    let daemon = home.start();
+    fill(&daemon);
+    let looks = stdout(
+        &home.coseg(&["top", "-n", "2", "--interval", "0.1", "--json"]),
+        0,
+    );
+    let looks: Vec<serde_json::Value> = looks
+        .lines()
+        .map(|l| serde_json::from_str(l).unwrap())
+        .collect();
+    assert_eq!((looks.len(), &looks[1]["n_placed"]), (2, &2.into()));
+    let stages = looks[0]["stages"].as_array().unwrap();
+    assert!(
+        stages
+            .iter()
+            .any(|s| s["stage"] == "spectrum" && s["n_shapes"] == 2)
+    );
+    let text = stdout(&home.coseg(&["top", "-n", "1"]), 0);
+    assert!(
+        text.contains("2 shapes in 1 collections") && !text.contains('\x1b'),
+        "{text}"
+    );
+}
+
+#[test]
+fn shells_and_manuals_know_every_command() {
+    let run = |args: &[&str]| stdout(&coseg().args(args).output().unwrap(), 0);
+    for shell in ["bash", "zsh", "fish"] {
+        let script = run(&["completions", shell]);
+        assert!(
+            script.contains("working-faces") && script.contains("suggest"),
+            "{shell}"
+        );
+    }
+    assert!(run(&["man"]).starts_with(".ie"));
+    let home = Home::new();
+    let pages = home.path("man").display().to_string();
+    run(&["man", "--out", &pages]);
+    for name in ["coseg.1", "coseg-view.1", "coseg-collections-create.1"] {
+        assert!(home.path("man").join(name).is_file(), "{name}");
+    }
+}
+
+#[test]
+fn an_address_that_others_reach_must_be_allowed() {
+    let home = Home::new();
+    let refused = home.spawn(&["--http", "0.0.0.0:0"], &[]);
+    let (status, said) = refused.ended();
+    assert_eq!(status.code(), Some(2));
+    assert!(
+        said.iter().any(|l| l.contains("http.allow_remote")),
+        "{said:?}"
+    );
+    home.start_with(
+        &["--http", "0.0.0.0:0"],
+        &[("COSEG__HTTP__ALLOW_REMOTE", "true")],
+    );
+}

@@ -1,0 +1,240 @@
+// Drives the viewer in headless Chromium and looks at what it shows.
+//
+//   node viewer.mjs empty URL OUT          a library without a collection
+//   node viewer.mjs all URL OUT FILE       everything, live and from a file; COSEG_BIN and COSEG_ENDPOINT are set
+
+import assert from "node:assert/strict";
+import { execFileSync } from "node:child_process";
+import { pathToFileURL } from "node:url";
+import { chromium } from "playwright-core";
+
+const [what, url, out, file] = process.argv.slice(2);
+const coseg = (...args) => JSON.parse(execFileSync(process.env.COSEG_BIN, [...args, "--json", "--timeout", "60"], { encoding: "utf8" }));
+
+const browser = await chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  // Software drawing, as machines without a graphics card have it.
+  args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+});
+
+let passed = 0;
+let failed = 0;
+async function test(name, work) {
+  try {
+    await work();
+    passed += 1;
+    console.log(`ok   ${name}`);
+  } catch (error) {
+    failed += 1;
+    console.log(`FAIL ${name}\n${error.stack ?? error}`);
+  }
+}
+
+/** A page that fails the test that uses it if anything goes wrong in it or anything else is asked for. */
+async function open(address, { theme = "light", width = 1440, height = 900 } = {}) {
+  const context = await browser.newContext({ viewport: { width, height }, colorScheme: theme });
+  const page = await context.newPage();
+  page.setDefaultTimeout(90_000);
+  page.faults = [];
+  page.on("console", (message) => message.type() === "error" && page.faults.push(message.text()));
+  page.on("pageerror", (error) => page.faults.push(String(error)));
+  page.on("dialog", (dialog) => dialog.accept());
+  page.on("request", (request) => {
+    const target = request.url();
+    const own = target.startsWith(url) || target.startsWith("file:") || target.startsWith("data:");
+    if (!own) page.faults.push(`asked for ${target}`);
+  });
+  await page.goto(address);
+  await page.waitForSelector("html[data-ready]", { timeout: 60_000 });
+  return page;
+}
+
+/** Distinct colours of a canvas, coarsely; one or two mean that nothing was drawn. */
+const colours = (page, selector) =>
+  page.$eval(selector, (canvas) => {
+    const copy = document.createElement("canvas");
+    [copy.width, copy.height] = [canvas.width, canvas.height];
+    const context = copy.getContext("2d");
+    context.drawImage(canvas, 0, 0);
+    const { data } = context.getImageData(0, 0, copy.width, copy.height);
+    const seen = new Set();
+    for (let i = 0; i < data.length; i += 4) seen.add(`${data[i] >> 5} ${data[i + 1] >> 5} ${data[i + 2] >> 5}`);
+    return seen.size;
+  });
+
+async function select(page, name) {
+  await page.click(`.card[data-name="${name}"]`);
+  await page.waitForSelector(`#stage[data-shown="${name} labels"]`);
+}
+
+async function mode(page, name, wanted) {
+  await page.click(`[data-mode=${wanted}]`);
+  await page.waitForSelector(`#stage[data-shown="${name} ${wanted}"]`);
+}
+
+const shot = (page, name) => page.screenshot({ path: `${out}/${name}.png` });
+const ready = (page) => page.$eval("html", (root) => ({ ...root.dataset }));
+
+if (what === "empty") {
+  await test("an empty library says what to do", async () => {
+    const page = await open(url);
+    assert.match(await page.textContent("#empty"), /coseg add/);
+    await shot(page, "empty");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+} else {
+  const names = coseg("ls", "--collection", "chairs").shapes.map((s) => s.name);
+  const [first, second] = names;
+
+  await test("the gallery shows every shape in the colours of its labels", async () => {
+    const page = await open(url);
+    await page.selectOption("#collections", "chairs");
+    await page.waitForFunction((n) => document.querySelectorAll(".card canvas[data-drawn]").length === n, names.length);
+    assert.equal(await page.$$eval(".card", (cards) => cards.length), names.length);
+    assert.ok((await colours(page, `.card[data-name="${first}"] canvas`)) > 8);
+    await page.waitForSelector("#state.pill");
+    await shot(page, "gallery");
+    await page.fill("#search", second);
+    assert.equal(await page.$$eval(".card", (cards) => cards.length), 1);
+    await page.fill("#search", "no such shape");
+    assert.match(await page.textContent("#empty"), /Nothing found/);
+    await page.fill("#search", "");
+    await page.click("#legend .chip");
+    assert.match(await page.textContent("#count"), /shapes/);
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("a shape is turned, its parts, neighbours and history are listed", async () => {
+    const page = await open(`${url}#chairs`);
+    await select(page, first);
+    const parts = coseg("show", first, "--collection", "chairs").parts;
+    assert.equal(await page.$$eval(".part", (rows) => rows.length), parts.length);
+    await page.waitForSelector(".near button");
+    assert.match(await page.textContent(".log"), /added/);
+    const before = await page.$eval("#scene", (c) => c.toDataURL());
+    const box = await page.locator("#scene").boundingBox();
+    await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+    await page.mouse.down();
+    await page.mouse.move(box.x + box.width / 2 + 120, box.y + box.height / 2 + 30, { steps: 4 });
+    await page.mouse.up();
+    await page.waitForTimeout(100);
+    assert.notEqual(await page.$eval("#scene", (c) => c.toDataURL()), before);
+    await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2 + 1);
+    await shot(page, "shape");
+    await page.keyboard.press("Escape");
+    assert.ok(await page.isHidden("#stage"));
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("functions and maps are shown as colours", async () => {
+    const page = await open(`${url}#chairs`, { theme: "dark" });
+    await select(page, second);
+    await mode(page, second, "eigen");
+    assert.ok((await colours(page, "#scene")) > 8);
+    const first = await page.$eval("#scene", (c) => c.toDataURL());
+    await page.locator("#controls input[type=range]").fill("6");
+    await page.waitForFunction(() => document.querySelector("#controls output").textContent.startsWith("7,"));
+    await page.waitForTimeout(150);
+    assert.notEqual(await page.$eval("#scene", (c) => c.toDataURL()), first);
+    await shot(page, "eigenfunction");
+    await mode(page, second, "hks");
+    assert.match(await page.textContent("#controls output"), /t = /);
+    await shot(page, "hks");
+    await mode(page, second, "map");
+    await page.waitForSelector("canvas.heat");
+    assert.ok((await colours(page, "canvas.heat")) > 4);
+    assert.equal(await page.$$eval("#captions > div", (c) => c.length), 2);
+    await shot(page, "map");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("a label that is renamed keeps its name in the daemon", async () => {
+    const page = await open(`${url}#chairs`);
+    const label = await page.getAttribute("#legend .chip", "data-label");
+    await page.click("#legend .chip .pencil");
+    await page.fill("#legend .chip input", "leg <b>&");
+    await page.keyboard.press("Enter");
+    await page.waitForFunction(() => document.querySelector("#legend .chip .text")?.textContent === "leg <b>&");
+    const labels = coseg("show", "--collection", "chairs").labels;
+    assert.equal(labels.find((l) => l.id === Number(label)).name, "leg <b>&");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("a painted correction is sent, carried and undone", async () => {
+    const page = await open(`${url}#chairs`);
+    await select(page, first);
+    await mode(page, first, "correct");
+    const before = coseg("labels", first, "--collection", "chairs").labels;
+    const chosen = Number(await page.getAttribute(".palette button:last-child", "data-label"));
+    await page.click(".palette button:last-child");
+    assert.ok(await page.isDisabled("#apply"));
+    const box = await page.locator("#scene").boundingBox();
+    // Along a line through the middle: somewhere there is the shape.
+    for (let i = 0; i <= 12; i++) {
+      await page.mouse.move(box.x + box.width / 2, box.y + box.height * (0.2 + i * 0.05));
+      await page.mouse.down();
+      await page.mouse.up();
+    }
+    assert.ok(await page.isEnabled("#apply"));
+    await shot(page, "correct");
+    await page.click("#apply");
+    await page.waitForSelector(".toast");
+    const after = coseg("labels", first, "--collection", "chairs").labels;
+    const n = after.filter((l) => l === chosen).length;
+    assert.ok(n > 0 && !before.includes(chosen), `${n} faces have label ${chosen}`);
+    coseg("wait", "--collection", "chairs");
+    await page.click("#undo");
+    await page.waitForFunction(() => [...document.querySelectorAll(".toast")].some((t) => t.textContent.startsWith("Undone: correct")));
+    coseg("wait", "--collection", "chairs");
+    assert.deepEqual(coseg("labels", first, "--collection", "chairs").labels, before);
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("other sites' pages change nothing", async () => {
+    const body = JSON.stringify({ collection: "chairs" });
+    const post = (headers) => fetch(`${url}api/undo`, { method: "POST", body, headers });
+    assert.equal((await post({})).status, 403);
+    assert.equal((await post({ "x-coseg": "1", origin: "http://example.org" })).status, 403);
+    assert.equal((await fetch(`${url}metrics`)).status, 200);
+    assert.match(await (await fetch(`${url}readyz`)).text(), /ready/);
+  });
+
+  await test("the page is one file that needs nothing else", async () => {
+    const page = await open(pathToFileURL(file).href);
+    const times = await ready(page);
+    console.log(`     first pictures after ${times.visibleMs} ms, all shapes read after ${times.loadedMs} ms`);
+    assert.equal(await page.$$eval(".card", (cards) => cards.length), names.length);
+    assert.ok((await colours(page, `.card[data-name="${first}"] canvas`)) > 8);
+    await select(page, second);
+    for (const wanted of ["eigen", "hks", "map"]) {
+      await mode(page, second, wanted);
+      assert.ok((await colours(page, "#scene")) > 8, wanted);
+      assert.ok(await page.isHidden("#notice"), wanted);
+    }
+    assert.ok(await page.isHidden("[data-mode=correct]"));
+    assert.ok(await page.isHidden("#undo"));
+    await shot(page, "file");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("a narrow screen shows the shape with its parts below", async () => {
+    const page = await open(`${url}#chairs/${first}/labels`, { width: 420, height: 860 });
+    await page.waitForSelector(`#stage[data-shown="${first} labels"]`);
+    const width = await page.$eval("body", (b) => b.scrollWidth);
+    assert.ok(width <= 420, `the page is ${width} pixels wide`);
+    await shot(page, "narrow");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+}
+
+await browser.close();
+console.log(`${passed} passed, ${failed} failed`);
+process.exit(failed ? 1 : 0);
