@@ -53,6 +53,19 @@ impl Meshed {
         }
     }
 
+    /// As pyFM computed it.
+    fn of_pyfm(path: &Path) -> Self {
+        let single = |name: &str| -> Vec<f32> {
+            let array = npz::read(path, name);
+            array.values.iter().map(|x| *x as f32).collect()
+        };
+        Self {
+            values: npz::read(path, "evals").values,
+            vectors: single("evecs"),
+            mass: single("mass_diag"),
+        }
+    }
+
     fn basis(&self) -> Basis<'_> {
         Basis {
             eigenvalues: &self.values,
@@ -74,16 +87,23 @@ fn zoomout_from_the_same_map_is_that_of_pyfm() {
     };
     let reference = peers.join("ref/cat_lion.npz");
     let array = |name: &str| npz::read(&reference, name);
-    let cat = Meshed::new(&peers.join("meshes/cat-00.off"), 200);
-    let lion = Meshed::new(&peers.join("meshes/lion-00.off"), 200);
     let truth: Vec<u32> = array("gt_p2p21").values.iter().map(|x| *x as u32).collect();
-    // Eigenvectors have signs of their own, so entries agree in magnitude; pointwise maps do not know them.
+    // Eigenvectors have signs of their own, so entries agree in magnitude.
+    let cat = Meshed::new(&peers.join("meshes/cat-00.off"), 20);
+    let lion = Meshed::new(&peers.join("meshes/lion-00.off"), 20);
     let c = functional(&cat.basis(), &lion.basis(), &truth, 20, 20);
     let theirs = array("D_C0");
     assert_eq!(theirs.shape, [20, 20]);
     for (x, y) in c.iter().zip(&theirs.values) {
         assert!((f64::from(x.abs()) - y.abs()).abs() < 1e-3, "{x} {y}");
     }
+    let Some(full) = std::env::var_os("COSEG_TEST_PEERS").map(PathBuf::from) else {
+        println!("skipped: COSEG_TEST_PEERS does not name the folder of pyFM's bases");
+        return;
+    };
+    let cat = Meshed::of_pyfm(&full.join("cat-00_spectrum.npz"));
+    let lion = Meshed::of_pyfm(&full.join("lion-00_spectrum.npz"));
+    let c: Vec<f32> = theirs.values.iter().map(|x| *x as f32).collect();
     let (large, p2p_21) = zoomout(&cat.basis(), &lion.basis(), &c, 20, 5, 36);
     assert_eq!(large.len(), 200 * 200);
     let theirs = array("D_zo_p2p21").values;
