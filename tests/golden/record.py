@@ -461,8 +461,8 @@ def small(r: Recorder) -> None:
     create = {"create": {}}
     r.say("error_mesh_too_large", "a file beyond the limit", [a], **add([encoded("a")], **create))
     r.say(
-        "error_queue_full",
-        "two shapes where one may wait: try again later",
+        "error_larger_than_the_queue",
+        "two shapes where one may ever wait: send fewer",
         [b"OFF\n", b"OFF\n"],
         **add([encoded("a"), encoded("b", 1)], **create),
     )
@@ -492,6 +492,7 @@ def composed(r: Recorder) -> None:
         "PANIC": ("INTERNAL", "answering panicked", {}),
         "SHAPE_TIMEOUT": ("DEADLINE_EXCEEDED", "describing took longer than 600 s", {}),
         "CANCELLED": ("CANCELLED", "the job was cancelled", {}),
+        "QUEUE_FULL": ("RESOURCE_EXHAUSTED", "64 shapes are queued and 1 more asked for", {"retry_after_ms": 1000}),
         "MEMORY_LIMIT": ("RESOURCE_EXHAUSTED", "requests in hand leave no memory", {"retry_after_ms": 250}),
         "DRAINING": ("FAILED_PRECONDITION", "the daemon is shutting down", {"job_id": 7}),
         "PATH_UNREADABLE": ("INVALID_ARGUMENT", "/meshes/a.off is not a regular file", {}),

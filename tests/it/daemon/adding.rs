@@ -303,24 +303,37 @@ fn a_cancelled_job_ends_and_the_next_is_done() {
 #[test]
 fn a_full_queue_is_said_with_a_delay() {
     let home = Home::new();
-    let daemon = home.start_with(&[], &[("COSEG__LIMITS__MAX_QUEUED_SHAPES", "1")]);
+    let daemon = home.start_with(&[], &[("COSEG__LIMITS__MAX_QUEUED_SHAPES", "2")]);
     let client = &mut daemon.client();
     let text = skittle(0);
-    let (body, frames) = add_request("c", &[("a", &text), ("b", &text)], wire::AddMode::Job);
-    match client.call(body, frames) {
+    let mut send = |names: &[&str]| {
+        let shapes: Vec<(&str, &str)> = names.iter().map(|n| (*n, text.as_str())).collect();
+        let (body, frames) = add_request("c", &shapes, wire::AddMode::Job);
+        client.call(body, frames)
+    };
+    send(&["a", "b"]).unwrap();
+    // Two shapes are not described and placed in the time that the next request takes.
+    match send(&["c", "d"]) {
         Err(ClientError::Refused(e)) => {
             assert_eq!(e.code(), ErrorCode::ResourceExhausted);
             assert_eq!(e.reason(), ErrorReason::QueueFull);
             assert!(e.retry_after_ms > 0);
-            assert_eq!(
-                e.message,
-                "0 shapes are queued and 2 more asked for, the limit is 1"
-            );
+            let end = "shapes are queued and 2 more asked for, the limit is 2";
+            assert!(e.message.ends_with(end), "{}", e.message);
         }
         other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
     }
+    match send(&["e", "f", "g"]) {
+        Err(ClientError::Refused(e)) => {
+            assert_eq!(e.code(), ErrorCode::InvalidArgument);
+            let text = "the request has 3 shapes, the whole queue holds 2";
+            assert_eq!(e.message, text);
+        }
+        other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
+    }
+    wait_idle(client, "c");
     assert_eq!(
-        add(client, "c", &[("a", &text)]).items[0].state(),
+        add(client, "c", &[("h", &text)]).items[0].state(),
         ItemState::Done
     );
 }
