@@ -137,6 +137,23 @@ impl Session {
         }
     }
 
+    /// The collection that is named, or the only one; idle, unless that is not to be waited for.
+    pub(crate) fn settled_collection(
+        &mut self,
+        name: Option<&String>,
+        within: &InCollection,
+        no_wait: bool,
+    ) -> Result<String, CommandError> {
+        let collection = match name {
+            Some(name) => name.clone(),
+            None => self.collection(within)?,
+        };
+        if !no_wait {
+            self.wait_until_idle(&collection)?;
+        }
+        Ok(collection)
+    }
+
     /// Waits until the collection has nothing left to do, for as long as the daemon answers.
     pub(crate) fn wait_until_idle(&mut self, collection: &str) -> Result<(), CommandError> {
         let mut bar = None;

@@ -1,10 +1,10 @@
 //! Files of every format in, labels in every format out, and what is found in the wild.
 
-use crate::harness::{Home, SKITTLE_FACES, json, skittle, stdout};
+use crate::harness::{Home, SKITTLE_FACES, json, messy_files, skittle, stdout};
 use coseg::library::{CollectionSpec, LibraryError, NewShape};
 use coseg::mesh::{Format, ParsedMesh, parse, write};
 use coseg::{Library, synth};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 fn read(path: impl AsRef<Path>) -> Vec<u8> {
     let path = path.as_ref();
@@ -171,26 +171,11 @@ fn add(library: &Library, name: &str, bytes: Vec<u8>, format: Format) -> Result<
     library.add("all", shape).map(|_| ())
 }
 
-fn files(folder: &Path, into: &mut Vec<PathBuf>) {
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        if path.is_dir() {
-            files(&path, into);
-        } else {
-            into.push(path);
-        }
-    }
-}
-
 #[test]
 fn every_messy_file_is_labelled_or_refused_with_a_reason() {
-    let Some(data) = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from) else {
-        println!("skipped: COSEG_TEST_DATA is not set");
+    let Some(paths) = messy_files() else {
         return;
     };
-    let mut paths = Vec::new();
-    files(&data.join("messy"), &mut paths);
-    paths.sort();
     let (_folder, library) = library();
     let mut n_labelled = 0;
     for (i, path) in paths.iter().enumerate() {

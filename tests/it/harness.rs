@@ -328,3 +328,25 @@ pub(crate) fn json(output: &Output, code: i32) -> serde_json::Value {
 pub(crate) fn exists(path: impl AsRef<Path>) -> bool {
     path.as_ref().exists()
 }
+
+/// The messy meshes of the benchmark data, by path; `None`, and a notice, where there is none.
+pub(crate) fn messy_files() -> Option<Vec<PathBuf>> {
+    fn files(folder: &Path, into: &mut Vec<PathBuf>) {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                files(&path, into);
+            } else {
+                into.push(path);
+            }
+        }
+    }
+    let Some(data) = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from) else {
+        println!("skipped: COSEG_TEST_DATA is not set");
+        return None;
+    };
+    let mut paths = Vec::new();
+    files(&data.join("messy"), &mut paths);
+    paths.sort();
+    Some(paths)
+}

@@ -25,13 +25,7 @@ const LINE: usize = GLYPH + 6;
 const ASPECT: f64 = 1.5;
 
 pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
-    let collection = match &args.name {
-        Some(name) => name.clone(),
-        None => session.collection(&args.within)?,
-    };
-    if !args.no_wait {
-        session.wait_until_idle(&collection)?;
-    }
+    let collection = session.settled_collection(args.name.as_ref(), &args.within, args.no_wait)?;
     let about = session.describe(&collection)?;
     let mut shapes = session.shapes(&collection, None)?;
     if let Some(max) = args.max {

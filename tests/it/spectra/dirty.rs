@@ -1,9 +1,9 @@
 //! Meshes as they come: each has a spectrum under every operator, or is refused with a reason.
 
 use super::smallest;
+use crate::harness::messy_files;
 use coseg::mesh::{self, Format, TriMesh};
 use coseg::operators::{Laplacian, LaplacianError, Operator, laplacian};
-use std::path::{Path, PathBuf};
 
 const OPERATORS: [Operator; 3] = [Operator::Tufted, Operator::Cotan, Operator::MeshLaplace];
 /// Rows of W sum to zero but for rounding, relative to the row's largest entry.
@@ -75,26 +75,11 @@ fn spectra(name: &str, mesh: &TriMesh) -> Vec<String> {
     refusals
 }
 
-fn files(folder: &Path, into: &mut Vec<PathBuf>) {
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        if path.is_dir() {
-            files(&path, into);
-        } else {
-            into.push(path);
-        }
-    }
-}
-
 #[test]
 fn every_messy_file_has_spectra_or_a_named_refusal() {
-    let Some(data) = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from) else {
-        println!("skipped: COSEG_TEST_DATA is not set");
+    let Some(paths) = messy_files() else {
         return;
     };
-    let mut paths = Vec::new();
-    files(&data.join("messy"), &mut paths);
-    paths.sort();
     let (mut n_solved, mut refusals) = (0, Vec::new());
     for path in paths {
         let name = path.file_name().unwrap().to_string_lossy().into_owned();
