@@ -30,6 +30,9 @@ step "Python: style, types, tests"
     python -m pytest --durations=3
 )
 
+step "documents: what they say to type, and the Python that is no program of its own"
+python "$ROOT/tests/docs/run.py" "$COSEG_BIN"
+
 step "Python: wheel"
 rm -rf "$WORK/wheel"
 python -m pip wheel -q --no-deps --no-build-isolation -w "$WORK/wheel" ./python
