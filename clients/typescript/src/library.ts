@@ -14,7 +14,7 @@ import { EventSchema, type Event as WireEvent } from "./gen/coseg/v1/event_pb.js
 import { ItemState, Outcome, type Job as WireJob, type JobItem, type WaitIdleReply } from "./gen/coseg/v1/job_pb.js";
 import { RequestSchema, type Reply, type Request } from "./gen/coseg/v1/message_pb.js";
 import type { Shape as WireShape } from "./gen/coseg/v1/shape_pb.js";
-import { Transport, type Curve, type Subscription } from "./transport.js";
+import { curveFromEnv, Transport, type Curve, type Subscription } from "./transport.js";
 import { FrameWriter, formatName, plain, Raw, type Encoded, type Matrix, type Mesh, type Plain } from "./wire.js";
 
 /** Longest single wait in the daemon: so long a change of mind takes to be noticed. */
@@ -132,7 +132,7 @@ export interface Options {
    * lives does not count; a daemon that restarts in this time gets the same requests again.
    */
   readonly timeout?: number;
-  /** Keys of an encrypted connection. */
+  /** Keys of an encrypted connection; else those of the files `$COSEG_SERVER_KEY` and `$COSEG_CLIENT_KEY`, if set. */
   readonly curve?: Curve;
   /** With a request's id the key under which changes have one effect; made up if it is not given. */
   readonly clientId?: string;
@@ -166,7 +166,7 @@ export class Library {
   constructor(options: Options = {}) {
     this.endpoint = options.endpoint ?? defaultEndpoint();
     this.clientId = options.clientId ?? `typescript-${randomUUID()}`;
-    this.transport = new Transport(this.endpoint, options.timeout ?? 30, options.curve);
+    this.transport = new Transport(this.endpoint, options.timeout ?? 30, options.curve ?? curveFromEnv());
   }
 
   /** Closes the connection. */
@@ -287,6 +287,23 @@ export class Library {
   /** Cancels the shapes of a job that are not placed yet. */
   async cancel(jobId: bigint): Promise<Job> {
     return job((await this.call("cancelJob", { jobId }))[0].job);
+  }
+
+  /** Jobs, the newest first; with `failed` those of which a shape failed, each with its failed shapes alone. */
+  async *jobs(options: { failed?: boolean; collection?: string } = {}): AsyncGenerator<Job> {
+    let before = 0n;
+    for (;;) {
+      const [reply] = await this.call("listJobs", { ...options, before });
+      for (const message of reply.jobs) yield job(message);
+      const last = reply.jobs.at(-1);
+      if (!reply.more || last === undefined) return;
+      before = last.jobId;
+    }
+  }
+
+  /** Queues the failed shapes of a job again, once what made them fail is mended. With keys: for the role `admin`. */
+  async retry(jobId: bigint): Promise<Job> {
+    return job((await this.call("retryJob", { jobId }))[0].job);
   }
 }
 

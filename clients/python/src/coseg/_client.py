@@ -41,7 +41,8 @@ class Library:
         that takes longer while the daemon lives does not count; a daemon that restarts in this time
         gets the same requests again, which have one effect.
     ``curve``
-        Keys of an encrypted connection.
+        Keys of an encrypted connection; by default those of the files that ``$COSEG_SERVER_KEY`` and
+        ``$COSEG_CLIENT_KEY`` name, if they do.
     ``client_id``
         With a request's id the key under which changes have one effect; made up if it is not given.
 
@@ -58,7 +59,7 @@ class Library:
     ) -> None:
         self.endpoint = endpoint or default_endpoint()
         self.client_id = client_id or new_client_id()
-        self._transport = Transport(self.endpoint, timeout, curve)
+        self._transport = Transport(self.endpoint, timeout, curve or Curve.from_env())
         self._numbers = itertools.count(1)
         # Request ids of two programs under one client id must differ.
         self._run = uuid.uuid4().hex[:12]
@@ -201,6 +202,24 @@ class Library:
     def cancel(self, job_id: int) -> t.Job:
         """Cancels the shapes of a job that are not placed yet."""
         reply, _ = self.call("cancel_job", job_id=job_id)
+        return wire.job(reply.job)
+
+    def jobs(self, *, failed: bool = False, collection: str = "") -> Iterator[t.Job]:
+        """Jobs, the newest first; with ``failed`` those of which a shape failed, each with its failed
+        shapes alone."""
+        before = 0
+        while True:
+            reply, _ = self.call("list_jobs", failed=failed, collection=collection, before=before)
+            for message in reply.jobs:
+                yield wire.job(message)
+            if not reply.more:
+                return
+            before = reply.jobs[-1].job_id
+
+    def retry(self, job_id: int) -> t.Job:
+        """Queues the failed shapes of a job again, once what made them fail is mended. With keys that
+        needs the role ``admin``."""
+        reply, _ = self.call("retry_job", job_id=job_id)
         return wire.job(reply.job)
 
 
