@@ -96,6 +96,8 @@ pub enum ParseError {
     Json { reason: String },
     #[error("{place} {why}")]
     Gltf { place: String, why: String },
+    #[error("the file cannot be read: {reason}")]
+    Reader { reason: String },
 }
 
 /// What the bytes of a file in `format` hold.

@@ -1,106 +1,188 @@
-//! Wavefront OBJ: its `v` and `f` statements.
+//! Wavefront OBJ: its `v` and `f` statements, read by `tobj`.
 //!
-//! Groups, objects and materials do not reorder anything; polylines and points are no faces. A vertex's
-//! weight or colour and a corner's texture and normal indices are not geometry and are left out. A face
-//! may name vertices that come after it, as many writers have it; a negative index counts back from the
-//! last vertex before the face.
+//! Only these two statements reach `tobj`, one clean line each, because given a whole file it
+//! - counts polylines (`l a b c`) as polygons and splits the polygons over groups and materials,
+//! - numbers vertices by first use and forgets the others,
+//! - knows neither continued lines nor comments behind a statement.
+//!
+//! A first polygon that names all vertices makes it keep the numbers of the file. Groups, objects and
+//! materials do not reorder anything. A vertex's weight or colour and a corner's texture and normal indices
+//! are not geometry and are left out. A face may name vertices that come after it, as many writers have
+//! it; a negative index counts back from the last vertex before the face.
 
-use super::text::{Lines, before_comment, number, position, words};
-use super::{MAX_CORNERS, ParseError, Polygons};
+use super::text::{Lines, before_comment, number, words};
+use super::{MAX_CORNERS, ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
+use std::io::Read as _;
 
-/// What the statements so far say.
+const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
+    triangulate: false,
+    single_index: false,
+    ignore_points: false,
+    ignore_lines: false,
+};
+
+/// The geometry of a file, as lines for `tobj`.
 #[derive(Default)]
 struct Geometry {
-    vertices: Vec<[f64; 3]>,
-    /// Corners of all faces, from 0; checked against the number of vertices at the end.
-    corners: Vec<u32>,
-    /// Where each face's corners end.
-    ends: Vec<usize>,
+    text: Vec<u8>,
+    /// Line of the file of each statement.
+    lines: Vec<usize>,
+    n_vertices: usize,
+    n_faces: usize,
 }
 
 impl Geometry {
+    fn of(bytes: &[u8]) -> Result<Self, ParseError> {
+        let mut geometry = Self::default();
+        let mut joined: Vec<u8> = Vec::new();
+        let mut first_line = 1;
+        for (number, line) in Lines::new(bytes) {
+            let line = line.trim_ascii_end();
+            if joined.is_empty() {
+                first_line = number;
+            }
+            if let Some(head) = line.strip_suffix(b"\\") {
+                joined.extend_from_slice(head);
+                joined.push(b' ');
+            } else if joined.is_empty() {
+                geometry.push(line, number)?;
+            } else {
+                joined.extend_from_slice(line);
+                geometry.push(&joined, first_line)?;
+                joined.clear();
+            }
+        }
+        geometry.push(&joined, first_line)?;
+        Ok(geometry)
+    }
+
     fn push(&mut self, statement: &[u8], line: usize) -> Result<(), ParseError> {
         let mut words = words(before_comment(statement));
         match words.next() {
-            Some(b"v") => self.vertices.push(position(line, &mut words)?),
+            Some(b"v") => {
+                self.text.push(b'v');
+                let mut found = 0;
+                for word in words.take(3) {
+                    self.word(word, line)?;
+                    found += 1;
+                }
+                if found < 3 {
+                    return Err(ParseError::ShortVertex { line, found });
+                }
+                self.n_vertices += 1;
+            }
             Some(b"f") => {
-                let face = self.ends.len();
-                let start = self.corners.len();
+                let face = self.n_faces;
+                self.text.push(b'f');
+                let mut corners = 0;
                 for word in words {
                     let vertex = word.split(|&b| b == b'/').next().unwrap_or_default();
-                    let corner = self.corner(number(line, vertex)?, face)?;
-                    self.corners.push(corner);
+                    self.word(vertex, line)?;
+                    corners += 1;
                 }
-                let found = self.corners.len() - start;
-                if found == 0 {
+                if corners == 0 {
                     return Err(ParseError::EmptyFace { line, face });
                 }
-                if found > MAX_CORNERS {
-                    return Err(ParseError::PolygonTooLarge {
-                        face,
-                        corners: found as u64,
-                    });
+                if corners > MAX_CORNERS {
+                    let corners = corners as u64;
+                    return Err(ParseError::PolygonTooLarge { face, corners });
                 }
-                self.ends.push(self.corners.len());
+                self.n_faces += 1;
             }
-            _ => {}
+            _ => return Ok(()),
         }
+        self.text.push(b'\n');
+        self.lines.push(line);
         Ok(())
     }
 
-    /// The vertex a corner names, from 0.
-    fn corner(&self, vertex: i64, face: usize) -> Result<u32, ParseError> {
-        let n_vertices = self.vertices.len();
-        let index = match vertex {
-            0 => None,
-            1.. => u32::try_from(vertex - 1).ok(),
-            _ => u32::try_from(n_vertices as i64 + vertex).ok(),
-        };
-        index.ok_or(ParseError::VertexOutOfRange {
-            face,
-            vertex,
-            n_vertices,
-        })
+    /// Anything but ASCII would make `tobj` refuse the text without saying which line.
+    fn word(&mut self, word: &[u8], line: usize) -> Result<(), ParseError> {
+        if word.is_empty() || !word.is_ascii() {
+            let token = shown(word);
+            return Err(ParseError::NotANumber { line, token });
+        }
+        self.text.push(b' ');
+        self.text.extend_from_slice(word);
+        Ok(())
+    }
+
+    /// Where and why `tobj` refused the text; it says neither line nor face.
+    fn fault(&self, error: &tobj::LoadError) -> ParseError {
+        let n_vertices = self.n_vertices;
+        let (mut n_seen, mut face) = (0_i64, 0);
+        for (statement, &line) in self.text.split(|&b| b == b'\n').zip(&self.lines) {
+            let mut words = words(statement);
+            let result = if words.next() == Some(b"v") {
+                n_seen += 1;
+                words.try_for_each(|word| number::<f64>(line, word).map(drop))
+            } else {
+                face += 1;
+                words.try_for_each(|word| {
+                    let vertex: i64 = number(line, word)?;
+                    let index = if vertex < 0 {
+                        n_seen + vertex
+                    } else {
+                        vertex - 1
+                    };
+                    if (0..n_vertices as i64).contains(&index) {
+                        return Ok(());
+                    }
+                    Err(ParseError::VertexOutOfRange {
+                        face: face - 1,
+                        vertex,
+                        n_vertices,
+                    })
+                })
+            };
+            if let Err(error) = result {
+                return error;
+            }
+        }
+        ParseError::Reader {
+            reason: error.to_string(),
+        }
     }
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
-    let mut geometry = Geometry::default();
-    let mut joined: Vec<u8> = Vec::new();
-    let mut first_line = 1;
-    for (number, line) in Lines::new(bytes) {
-        let line = line.trim_ascii_end();
-        if joined.is_empty() {
-            first_line = number;
-        }
-        if let Some(head) = line.strip_suffix(b"\\") {
-            joined.extend_from_slice(head);
-            joined.push(b' ');
-        } else if joined.is_empty() {
-            geometry.push(line, number)?;
-        } else {
-            joined.extend_from_slice(line);
-            geometry.push(&joined, first_line)?;
-            joined.clear();
-        }
+    let geometry = Geometry::of(bytes)?;
+    if geometry.n_faces == 0 {
+        return Err(ParseError::NoFaces);
     }
-    geometry.push(&joined, first_line)?;
-
-    let n_vertices = geometry.vertices.len();
-    let mut polygons = Polygons::new(geometry.vertices);
-    let mut start = 0;
-    for (face, &end) in geometry.ends.iter().enumerate() {
-        let corners = &geometry.corners[start..end];
-        if let Some(&beyond) = corners.iter().find(|&&v| v as usize >= n_vertices) {
-            return Err(ParseError::VertexOutOfRange {
-                face,
-                vertex: i64::from(beyond) + 1,
-                n_vertices,
-            });
+    let mut all_vertices = String::from("f");
+    for vertex in 1..=geometry.n_vertices {
+        all_vertices.push(' ');
+        all_vertices.push_str(&vertex.to_string());
+    }
+    all_vertices.push('\n');
+    let mut text = all_vertices.as_bytes().chain(geometry.text.as_slice());
+    let no_materials = |_: &std::path::Path| Err(tobj::LoadError::OpenFileFailed);
+    let (models, _) = tobj::load_obj_buf(&mut text, &OPTIONS, no_materials)
+        .map_err(|error| geometry.fault(&error))?;
+    let [model] = models.as_slice() else {
+        return Err(ParseError::Reader {
+            reason: format!("{} models, not 1", models.len()),
+        });
+    };
+    let mesh = &model.mesh;
+    let (positions, _) = mesh.positions.as_chunks::<3>();
+    let mut polygons = Polygons::new(positions.to_vec());
+    // No arities means triangles only.
+    let arities = mesh.face_arities.iter().map(|&n| n as usize);
+    let triangles = std::iter::repeat_n(3, mesh.indices.len() / 3);
+    let arities: Vec<usize> = match mesh.face_arities.is_empty() {
+        true => triangles.collect(),
+        false => arities.collect(),
+    };
+    let mut corners = mesh.indices.as_slice();
+    for (i, arity) in arities.into_iter().enumerate() {
+        let (polygon, rest) = corners.split_at(arity);
+        corners = rest;
+        if i > 0 {
+            polygons.push(polygon)?;
         }
-        polygons.push(corners)?;
-        start = end;
     }
     polygons.finish()
 }

@@ -89,6 +89,7 @@ fn ply_text_as_it_is_found() {
         format!("ply\nformat ascii 1.0\n{BODY}").replace('\n', "\r"),
         format!("ply\nformat ascii 1.0\nCreated by a program\n{BODY}\n\n"),
         format!("ply\nformat ascii 1.0\n{BODY}").replace("3 0 1 2", "3 0 1 2 9 1 1 1"),
+        format!("ply\nformat ascii 1.0\n{BODY}").replace("1 0 0", "1. .0 -0e0"),
     ] {
         assert_eq!(ply(text.as_bytes()).unwrap(), plain, "{text:?}");
     }
@@ -111,7 +112,7 @@ fn ply_errors_name_the_place_and_the_value() {
             "the file has no line end_header: the file is cut off within its header",
         ),
         (
-            "ply\nformat utf7 1.0\n".to_owned(),
+            "ply\nformat utf7 1.0\nend_header\n".to_owned(),
             "line 2: \"format utf7 1.0\" is no line of a PLY header",
         ),
         (
@@ -120,7 +121,7 @@ fn ply_errors_name_the_place_and_the_value() {
         ),
         (
             with("vertex 3", "vertex many"),
-            "line 3: \"many\" is not a number",
+            "line 3: \"element vertex many\" is no line of a PLY header",
         ),
         (
             with("vertex 3", "vertex 3000000000"),
@@ -168,11 +169,19 @@ fn ply_errors_name_the_place_and_the_value() {
         ),
         (
             with("3 0 1 2", "20000 0 1 2"),
-            "face 0 has 20000 corners, but at most 10000 are read",
+            "line 13 ends before all 1 properties of its row are given",
         ),
         (
             with("1 0 0\n", "1 0 nan\n"),
             "face 0 has a corner at (1, 0, NaN), but coordinates must be finite",
+        ),
+        (
+            with("3 0 1 2", &"0 ".repeat(10_002).replacen('0', "10001", 1)),
+            "face 0 has 10001 corners, but at most 10000 are read",
+        ),
+        (
+            with("property float z", "property float z\nproperty float x"),
+            "a header that declares the same element or property twice is not read, only one of each name",
         ),
         (
             with("3 0 1 2\n", "3 0 1 2\n3 2 1 0\n"),

@@ -1,4 +1,4 @@
-//! glTF 2.0, as JSON or in one binary file (GLB): the triangles of its default scene.
+//! glTF 2.0, as JSON or in one binary file (GLB), read by `gltf`: the triangles of its default scene.
 //!
 //! Faces come in this order: nodes depth first, a node's mesh before its children, both in the order of
 //! the file; a mesh's primitives in order; a primitive's triangles in order. Each triangle is a face. A
@@ -6,20 +6,22 @@
 //! targets are not applied. Nothing outside the file is read.
 
 mod buffers;
-mod json;
 
 use super::{ParseError, Polygons, shown};
-use crate::mesh::{ParsedMesh, add, cross, dot, scale};
+use crate::mesh::ParsedMesh;
 use buffers::Buffers;
-use json::{Node, Primitive, Root};
+use gltf::json::validation::{Error as Invalid, Validate as _};
+use gltf::json::{self, Root};
+use gltf::mesh::{Mode, Semantic};
+use gltf::{Document, Node, Primitive};
+use nalgebra::{Matrix4, Point3};
 use std::collections::BTreeMap;
 
-const MAGIC: &[u8] = b"glTF";
-const JSON_CHUNK: &[u8] = b"JSON";
-const BINARY_CHUNK: &[u8] = b"BIN\0";
 /// Vertices and corners that a scene may place beyond one for each two bytes of its file: nodes that place
 /// one mesh again and again could make a small file as large as they like.
 const ALLOWANCE: u64 = 1 << 16;
+/// Objects the JSON may have; each is many times as large in memory as in the file.
+const MAX_OBJECTS: usize = 1_000_000;
 /// Required extensions that leave triangles where they are; integer positions are read.
 const HARMLESS: [&str; 8] = [
     "KHR_materials_",
@@ -31,12 +33,8 @@ const HARMLESS: [&str; 8] = [
     "KHR_mesh_quantization",
     "KHR_animation_pointer",
 ];
-/// Kinds of primitives that are made of triangles.
-const TRIANGLES: u32 = 4;
-const STRIP: u32 = 5;
-const FAN: u32 = 6;
 
-fn fault(place: std::fmt::Arguments<'_>, why: std::fmt::Arguments<'_>) -> ParseError {
+fn fault(place: impl ToString, why: impl ToString) -> ParseError {
     ParseError::Gltf {
         place: place.to_string(),
         why: why.to_string(),
@@ -44,125 +42,109 @@ fn fault(place: std::fmt::Arguments<'_>, why: std::fmt::Arguments<'_>) -> ParseE
 }
 
 /// The JSON and the binary chunk of a file of either kind.
-fn container(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
-    if !bytes.starts_with(MAGIC) {
-        let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-        return if text.trim_ascii_start().starts_with(b"{") {
-            Ok((text, None))
-        } else {
-            Err(ParseError::BadHeader {
-                found: shown(&bytes[..bytes.len().min(8)]),
-                format: "a glTF",
-            })
-        };
+fn container(bytes: &[u8]) -> Result<(Document, Option<Vec<u8>>), ParseError> {
+    if bytes.starts_with(b"glTF") {
+        // The crate subtracts the length of the header from that of the file.
+        if bytes
+            .get(8..12)
+            .is_none_or(|length| length < &[12, 0, 0, 0][..] && length[1..] == [0; 3])
+        {
+            return Err(fault("the file", "ends within its header"));
+        }
+        let glb = gltf::Glb::from_slice(bytes).map_err(|e| unreadable(&e))?;
+        let document = document(&glb.json)?;
+        return Ok((document, glb.bin.map(|chunk| chunk.into_owned())));
     }
-    let word = |at: usize| {
-        let bytes = bytes.get(at..at + 4)?;
-        Some(u32::from_le_bytes(bytes.try_into().ok()?))
-    };
-    let cut = || {
-        fault(
-            format_args!("the file"),
-            format_args!(
-                "has {} bytes, which is fewer than its header declares",
-                bytes.len()
-            ),
-        )
-    };
-    let version = word(4).ok_or_else(cut)?;
-    if version != 2 {
-        return Err(ParseError::Unsupported {
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    if text.trim_ascii_start().starts_with(b"{") {
+        return Ok((document(text)?, None));
+    }
+    Err(ParseError::BadHeader {
+        found: shown(&bytes[..bytes.len().min(8)]),
+        format: "a glTF",
+    })
+}
+
+fn unreadable(error: &gltf::Error) -> ParseError {
+    match error {
+        gltf::Error::Binary(gltf::binary::Error::Version(version)) => ParseError::Unsupported {
             what: format!("glTF {version}"),
+            instead: "only glTF 2.0",
+        },
+        other => fault("the file", format_args!("is no whole GLB: {other}")),
+    }
+}
+
+/// A document in which every index that leads to triangles is in range.
+fn document(text: &[u8]) -> Result<Document, ParseError> {
+    let n_objects = text.iter().filter(|&&b| b == b'{').count();
+    if n_objects > MAX_OBJECTS {
+        return Err(fault(
+            "the JSON",
+            format_args!("has {n_objects} objects, but at most {MAX_OBJECTS} are read"),
+        ));
+    }
+    let root: Root = json::deserialize::from_slice(text).map_err(|e| ParseError::Json {
+        reason: e.to_string(),
+    })?;
+    if !root.asset.version.starts_with("2.") {
+        return Err(ParseError::Unsupported {
+            what: format!("glTF {}", shown(root.asset.version.as_bytes())),
             instead: "only glTF 2.0",
         });
     }
-    let length = word(8).ok_or_else(cut)? as usize;
-    let (mut at, mut json, mut binary) = (12, None, None);
-    if length > bytes.len() || length < at {
-        return Err(cut());
+    let harmless = |name: &str| HARMLESS.iter().any(|known| name.starts_with(known));
+    if let Some(name) = root.extensions_required.iter().find(|name| !harmless(name)) {
+        return Err(ParseError::Unsupported {
+            what: format!("a file that requires {}", shown(name.as_bytes())),
+            instead: "export it without that extension",
+        });
     }
-    while at + 8 <= length {
-        let size = word(at).ok_or_else(cut)? as usize;
-        let kind = &bytes[at + 4..at + 8];
-        let end = (at + 8).checked_add(size).filter(|&end| end <= length);
-        let chunk = &bytes[at + 8..end.ok_or_else(cut)?];
-        if json.is_none() && kind == JSON_CHUNK {
-            json = Some(chunk);
-        } else if binary.is_none() && kind == BINARY_CHUNK {
-            binary = Some(chunk);
-        }
-        at += 8 + size;
-    }
-    let json = json.ok_or(ParseError::Missing { what: "JSON chunk" })?;
-    Ok((json, binary))
+    check(&root)?;
+    Ok(Document::from_json_without_validation(root))
 }
 
-/// An affine map: three columns of a linear map, and a translation.
-#[derive(Debug, Clone, Copy)]
-struct Affine([[f64; 3]; 4]);
-
-impl Affine {
-    const IDENTITY: Self = Self([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0; 3]]);
-
-    fn of(node: &Node) -> Self {
-        if let Some(m) = &node.matrix {
-            return Self(std::array::from_fn(|c| {
-                std::array::from_fn(|r| m[4 * c + r])
-            }));
+/// Refuses indices that lead nowhere and values that glTF does not know, in what the scene is read from.
+fn check(root: &Root) -> Result<(), ParseError> {
+    // The crate's own check takes the bounds of positions from accessors that it has not looked for yet.
+    let n_accessors = root.accessors.len();
+    let primitives = root.meshes.iter().flat_map(|mesh| &mesh.primitives);
+    for index in primitives.flat_map(|primitive| primitive.attributes.values()) {
+        if index.value() >= n_accessors {
+            return Err(fault(
+                "a primitive",
+                format_args!(
+                    "names accessor {}, but the file has {n_accessors}",
+                    index.value()
+                ),
+            ));
         }
-        let [x, y, z, w] = node.rotation.as_ref().map_or([0.0, 0.0, 0.0, 1.0], |r| **r);
-        let [sx, sy, sz] = node.scale.as_ref().map_or([1.0; 3], |s| **s);
-        let columns = [
-            [
-                1.0 - 2.0 * (y * y + z * z),
-                2.0 * (x * y + z * w),
-                2.0 * (x * z - y * w),
-            ],
-            [
-                2.0 * (x * y - z * w),
-                1.0 - 2.0 * (x * x + z * z),
-                2.0 * (y * z + x * w),
-            ],
-            [
-                2.0 * (x * z + y * w),
-                2.0 * (y * z - x * w),
-                1.0 - 2.0 * (x * x + y * y),
-            ],
-        ];
-        Self([
-            scale(columns[0], sx),
-            scale(columns[1], sy),
-            scale(columns[2], sz),
-            node.translation.as_ref().map_or([0.0; 3], |t| **t),
-        ])
     }
-
-    fn direction(&self, [x, y, z]: [f64; 3]) -> [f64; 3] {
-        add(
-            add(scale(self.0[0], x), scale(self.0[1], y)),
-            scale(self.0[2], z),
-        )
-    }
-
-    fn point(&self, p: [f64; 3]) -> [f64; 3] {
-        add(self.direction(p), self.0[3])
-    }
-
-    /// First `inner`, then this.
-    fn after(&self, inner: &Self) -> Self {
-        let [a, b, c, t] = inner.0;
-        Self([
-            self.direction(a),
-            self.direction(b),
-            self.direction(c),
-            self.point(t),
-        ])
-    }
-
-    /// Whether left and right are exchanged, so that faces turn inside out.
-    fn mirrors(&self) -> bool {
-        dot(cross(self.0[0], self.0[1]), self.0[2]) < 0.0
-    }
+    const READ: [&str; 6] = [
+        "accessors",
+        "bufferViews",
+        "buffers",
+        "meshes",
+        "nodes",
+        "scene",
+    ];
+    let mut first = None;
+    root.validate(root, json::Path::new, &mut |path, error| {
+        let why = match error {
+            Invalid::IndexOutOfBounds => "names an entry that is not there",
+            Invalid::Invalid => "has a value that glTF does not know",
+            // Bounds that are missing, extensions: of no account here.
+            _ => return,
+        };
+        let path = path();
+        let is_bound = [".min", ".max"]
+            .iter()
+            .any(|end| path.as_str().ends_with(end));
+        if first.is_none() && !is_bound && READ.iter().any(|name| path.as_str().starts_with(name)) {
+            first = Some(fault(shown(path.as_str().as_bytes()), why));
+        }
+    });
+    first.map_or(Ok(()), Err)
 }
 
 /// The scene as it is put together.
@@ -175,11 +157,11 @@ struct Scene<'a> {
 }
 
 impl Scene<'_> {
-    fn place(&mut self, n: u64) -> Result<(), ParseError> {
-        self.n_placed = self.n_placed.saturating_add(n);
+    fn place(&mut self, n: usize) -> Result<(), ParseError> {
+        self.n_placed = self.n_placed.saturating_add(n as u64);
         if self.n_placed > self.limit {
             return Err(fault(
-                format_args!("the scene"),
+                "the scene",
                 format_args!(
                     "places more than {} vertices and corners, more than a file of its size may: its \
                      nodes repeat the same mesh",
@@ -193,64 +175,67 @@ impl Scene<'_> {
     /// Adds a mesh's primitives; `bases` holds where the positions of each accessor begin, once placed.
     fn primitive(
         &mut self,
-        primitive: &Primitive,
-        transform: &Affine,
-        bases: &mut BTreeMap<u32, u32>,
+        primitive: &Primitive<'_>,
+        transform: &Matrix4<f64>,
+        bases: &mut BTreeMap<usize, u32>,
     ) -> Result<(), ParseError> {
-        let mode = primitive.mode.unwrap_or(TRIANGLES);
-        let Some(accessor) = primitive.attributes.position else {
+        let mode = primitive.mode();
+        let Some(positions) = primitive.get(&Semantic::Positions) else {
             return Ok(());
         };
-        if ![TRIANGLES, STRIP, FAN].contains(&mode) {
+        if !matches!(
+            mode,
+            Mode::Triangles | Mode::TriangleStrip | Mode::TriangleFan
+        ) {
             return Ok(());
         }
-        let n_vertices = self.buffers.accessor(accessor)?.count;
-        let base = match bases.get(&accessor) {
+        let n_vertices = positions.count();
+        let base = match bases.get(&positions.index()) {
             Some(base) => *base,
             None => {
                 self.place(n_vertices)?;
-                let base = self.polygons.mesh.vertices.len() as u32;
-                let positions = self.buffers.positions(accessor)?;
-                let placed = positions.into_iter().map(|p| transform.point(p));
-                self.polygons.mesh.vertices.extend(placed);
-                bases.insert(accessor, base);
+                let vertices = &mut self.polygons.mesh.vertices;
+                let base = vertices.len() as u32;
+                for position in self.buffers.positions(&positions)? {
+                    let placed = transform.transform_point(&Point3::from(position));
+                    vertices.push(placed.coords.into());
+                }
+                bases.insert(positions.index(), base);
                 base
             }
         };
-        let n_corners = match primitive.indices {
-            Some(indices) => self.buffers.accessor(indices)?.count,
-            None => n_vertices,
-        };
+        let n_corners = primitive.indices().map_or(n_vertices, |i| i.count());
         self.place(n_corners)?;
-        let corners: Vec<u32> = match primitive.indices {
-            Some(indices) => self.buffers.indices(indices)?,
+        let corners: Vec<u32> = match primitive.indices() {
+            Some(indices) => self.buffers.indices(&indices)?,
             None => (0..n_vertices as u32).collect(),
         };
-        if mode == TRIANGLES && !corners.len().is_multiple_of(3) {
+        if mode == Mode::Triangles && !n_corners.is_multiple_of(3) {
             return Err(fault(
-                format_args!("a primitive of triangles"),
-                format_args!("has {} corners, which is no multiple of 3", corners.len()),
+                "a primitive of triangles",
+                format_args!("has {n_corners} corners, which is no multiple of 3"),
             ));
         }
         let n_triangles = match mode {
-            TRIANGLES => corners.len() / 3,
-            _ => corners.len().saturating_sub(2),
+            Mode::Triangles => n_corners / 3,
+            _ => n_corners.saturating_sub(2),
         };
-        let mirrors = transform.mirrors();
+        // Where left and right are exchanged, faces turn inside out.
+        let mirrors = transform.fixed_view::<3, 3>(0, 0).determinant() < 0.0;
         for i in 0..n_triangles {
             let [a, mut b, mut c] = match mode {
-                TRIANGLES => [corners[3 * i], corners[3 * i + 1], corners[3 * i + 2]],
-                STRIP => [corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]],
+                Mode::Triangles => [corners[3 * i], corners[3 * i + 1], corners[3 * i + 2]],
+                Mode::TriangleStrip => [corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]],
                 _ => [corners[i + 1], corners[i + 2], corners[0]],
             };
             if mirrors {
                 std::mem::swap(&mut b, &mut c);
             }
-            if let Some(beyond) = [a, b, c].into_iter().find(|&v| u64::from(v) >= n_vertices) {
+            if let Some(beyond) = [a, b, c].into_iter().find(|&v| v as usize >= n_vertices) {
                 return Err(ParseError::VertexOutOfRange {
                     face: self.polygons.mesh.n_polygons,
                     vertex: beyond.into(),
-                    n_vertices: n_vertices as usize,
+                    n_vertices,
                 });
             }
             self.polygons.push(&[a + base, b + base, c + base])?;
@@ -260,93 +245,51 @@ impl Scene<'_> {
 }
 
 /// The nodes a scene begins with: of the default scene, the first one, or all that are nobody's children.
-fn roots(root: &Root<'_>) -> Result<Vec<u32>, ParseError> {
-    let scenes = &root.scenes.0;
-    if let Some(scene) = root.scene
-        && scene >= scenes.len()
+fn roots(document: &Document) -> Vec<Node<'_>> {
+    if let Some(scene) = document
+        .default_scene()
+        .or_else(|| document.scenes().next())
     {
-        return Err(fault(
-            format_args!("the file"),
-            format_args!("names scene {scene}, but has {}", scenes.len()),
-        ));
+        return scene.nodes().collect();
     }
-    if let Some(scene) = scenes.get(root.scene.unwrap_or(0)) {
-        return Ok(scene.nodes.0.clone());
+    let mut is_child = vec![false; document.nodes().len()];
+    for child in document.nodes().flat_map(|node| node.children()) {
+        is_child[child.index()] = true;
     }
-    let mut is_child = vec![false; root.nodes.0.len()];
-    for child in root.nodes.0.iter().flat_map(|node| &node.children.0) {
-        if let Some(is_child) = is_child.get_mut(*child as usize) {
-            *is_child = true;
-        }
-    }
-    Ok((0..is_child.len() as u32)
-        .filter(|&i| !is_child[i as usize])
-        .collect())
+    document
+        .nodes()
+        .filter(|node| !is_child[node.index()])
+        .collect()
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
-    let (json, binary) = container(bytes)?;
-    let root = json::read(json)?;
-    let harmless = |name: &str| HARMLESS.iter().any(|known| name.starts_with(known));
-    if let Some(name) = root
-        .extensions_required
-        .0
-        .iter()
-        .find(|name| !harmless(name))
-    {
-        return Err(ParseError::Unsupported {
-            what: format!("a file that requires {}", shown(name.as_bytes())),
-            instead: "export it without that extension",
-        });
-    }
+    let (document, binary) = container(bytes)?;
     let mut scene = Scene {
-        buffers: Buffers::new(&root, binary),
+        buffers: Buffers::new(&document, binary.as_deref()),
         polygons: Polygons::new(Vec::new()),
         n_placed: 0,
         limit: ALLOWANCE + bytes.len() as u64 / 2,
     };
-    let (nodes, meshes) = (&root.nodes.0, &root.meshes.0);
-    let mut seen = vec![false; nodes.len()];
-    let mut todo: Vec<(u32, Affine)> = Vec::new();
-    todo.extend(
-        roots(&root)?
-            .into_iter()
-            .rev()
-            .map(|i| (i, Affine::IDENTITY)),
-    );
-    while let Some((index, outer)) = todo.pop() {
-        let Some(node) = nodes.get(index as usize) else {
+    let mut seen = vec![false; document.nodes().len()];
+    let outermost = roots(&document).into_iter().rev();
+    let mut todo: Vec<(Node<'_>, Matrix4<f64>)> =
+        outermost.map(|node| (node, Matrix4::identity())).collect();
+    while let Some((node, outer)) = todo.pop() {
+        if std::mem::replace(&mut seen[node.index()], true) {
             return Err(fault(
-                format_args!("the scene"),
-                format_args!("names node {index}, but the file has {}", nodes.len()),
-            ));
-        };
-        if std::mem::replace(&mut seen[index as usize], true) {
-            return Err(fault(
-                format_args!("node {index}"),
-                format_args!("is reached twice, but nodes must form a tree"),
+                format_args!("node {}", node.index()),
+                "is reached twice, but nodes must form a tree",
             ));
         }
-        let transform = outer.after(&Affine::of(node));
-        if let Some(mesh) = node.mesh {
-            let found = meshes.get(mesh as usize).ok_or_else(|| {
-                fault(
-                    format_args!("node {index}"),
-                    format_args!("names mesh {mesh}, but the file has {}", meshes.len()),
-                )
-            })?;
+        let transform = outer * Matrix4::from(node.transform().matrix()).cast();
+        if let Some(mesh) = node.mesh() {
             let mut bases = BTreeMap::new();
-            for primitive in &found.primitives.0 {
-                scene.primitive(primitive, &transform, &mut bases)?;
+            for primitive in mesh.primitives() {
+                scene.primitive(&primitive, &transform, &mut bases)?;
             }
         }
-        todo.extend(
-            node.children
-                .0
-                .iter()
-                .rev()
-                .map(|&child| (child, transform)),
-        );
+        let children: Vec<Node<'_>> = node.children().collect();
+        todo.extend(children.into_iter().rev().map(|child| (child, transform)));
     }
     scene.polygons.finish()
 }
