@@ -233,6 +233,7 @@ def fixture(coseg: Path, folder: Path) -> None:
     shutil.copy(folder / "meshes" / "101.off", folder / "chair.off")
     shutil.rmtree(folder / "made")
     synth("chair", "--count", "4", "--faces", "1000", "--out", str(folder / "benchmark" / "chairs"))
+    subprocess.run([sys.executable, ROOT / "benches" / "pieces.py", folder / "pieces"], check=True)
 
 
 def run_document(world: World, document: str) -> list[str]:
