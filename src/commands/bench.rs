@@ -1,7 +1,8 @@
-//! `coseg bench`: how good the product is on meshes whose parts are known.
+//! `coseg bench`: how good the product is on meshes whose parts are known, and how fast.
 
 use super::bench_labels::{Category, Run};
 use super::bench_maps::{self, BenchMaps};
+use super::bench_signatures::{self, BenchSignatures};
 use super::demo::{DRAIN_LIMIT, Scratch, log_warnings, start};
 use super::session::{Session, print_line, table};
 use super::{CommandError, Outcome, bench_labels};
@@ -20,6 +21,8 @@ pub(crate) enum Bench {
     Labels(BenchLabels),
     /// Map meshes with known correspondence to each other, and compare
     Maps(BenchMaps),
+    /// Time signatures of points, beside a copy of the eigenvectors they come from
+    Signatures(BenchSignatures),
 }
 
 /// `coseg bench labels`
@@ -123,6 +126,7 @@ pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
     let args = match bench {
         Bench::Labels(args) => args,
         Bench::Maps(args) => return bench_maps::run(args, global),
+        Bench::Signatures(args) => return bench_signatures::run(args, global),
     };
     let categories = bench_labels::categories(&args.data, &args.category, args.limit)?;
     let up = args.up.unwrap_or(wire::Up::Unknown);

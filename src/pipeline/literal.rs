@@ -45,8 +45,9 @@ impl Divided {
             ..Params::default()
         };
         let found = spectrum_of(&mesh, &bridges(&mesh), &params, &|_| true)?;
-        let (values, basis) = (found.spectrum.eigenvalues, found.spectrum.eigenvectors);
         let mass = found.operator.mass;
+        let spectrum = found.spectrum.into_spectrum();
+        let (values, basis) = (spectrum.eigenvalues, spectrum.eigenvectors);
         let signatures = hks(&values, &basis, &hks_times(&values, N_HKS_TIMES));
         let n = mass.len();
         let weighted = DMatrix::from_fn(n, N_HKS_TIMES, |v, t| {
