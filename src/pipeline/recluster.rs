@@ -266,3 +266,72 @@ fn rename(
     }
     (labels, found.labels, changes)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One shape of a few faces of equal area.
+    fn faces(n: usize) -> Vec<Prepared> {
+        vec![Prepared {
+            surface: Surface {
+                area: vec![1.0 / n as f64; n],
+                centroids: vec![[0.0; 3]; n],
+                edges: Vec::new(),
+            },
+            features: Features {
+                data: Vec::new(),
+                dim: 0,
+            },
+            at_vertices: Vec::new(),
+        }]
+    }
+
+    /// What becomes of label ids 10, 11, ... when faces of the classes `current` are found to be of the classes `found`.
+    fn renamed(current: &[u32], found: &[u32]) -> (Vec<u32>, Vec<LabelChange>) {
+        let n_classes = |classes: &[u32]| classes.iter().max().map_or(0, |c| *c as usize + 1);
+        let model = LabelModel {
+            epoch: 1,
+            labels: (10..10 + n_classes(current) as u32).collect(),
+            normalisation: Normalisation {
+                mean: Vec::new(),
+                deviation: Vec::new(),
+                up_known: false,
+            },
+            statistics: Statistics::empty(n_classes(current), 0),
+            up: None,
+        };
+        let discovery = Discovery {
+            labels: vec![found.to_vec()],
+            n_labels: n_classes(found),
+            value: 0.0,
+            current_value: 0.0,
+        };
+        let old = [current.to_vec()];
+        let (labels, classes, changes) =
+            rename(discovery, Some((&old, &model)), &faces(current.len()), 40);
+        assert_eq!(classes, [found.to_vec()]);
+        (labels, changes)
+    }
+
+    #[test]
+    fn classes_take_the_ids_of_the_labels_they_overlap_most() {
+        let (labels, changes) = renamed(&[0, 0, 0, 1, 1, 2], &[2, 2, 0, 0, 0, 1]);
+        assert_eq!((labels, changes), (vec![11, 12, 10], Vec::new()));
+    }
+
+    #[test]
+    fn a_label_that_is_two_parts_is_split_into_a_new_id() {
+        let (labels, changes) = renamed(&[0, 0, 0, 1, 1], &[0, 0, 2, 1, 1]);
+        assert_eq!(labels, [10, 11, 40]);
+        let split = LabelChange::Split { from: 10, into: 40 };
+        assert_eq!(changes, [LabelChange::Created(40), split]);
+    }
+
+    #[test]
+    fn a_label_that_is_no_part_of_its_own_is_merged() {
+        let (labels, changes) = renamed(&[0, 0, 0, 1, 1, 2], &[0, 0, 0, 1, 1, 1]);
+        assert_eq!(labels, [10, 11]);
+        assert_eq!(changes, [LabelChange::Merged { from: 12, into: 11 }]);
+    }
+}
