@@ -102,7 +102,7 @@ fn nodes_move_their_meshes_depth_first() {
     let close = |v: usize, wanted: [f64; 3]| {
         let found = mesh.vertices[v];
         assert!(
-            (0..3).all(|i| (found[i] - wanted[i]).abs() < 1e-6),
+            (0..3).all(|i| (found[i] - wanted[i]).abs() < 1e-12),
             "{v}: {found:?}"
         );
     };

@@ -6,6 +6,7 @@
 //! targets are not applied. Nothing outside the file is read.
 
 mod buffers;
+mod transforms;
 
 use super::{ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
@@ -15,6 +16,7 @@ use gltf::json::{self, Root};
 use gltf::mesh::{Mode, Semantic};
 use gltf::{Document, Node, Primitive};
 use nalgebra::{Matrix4, Point3};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// Vertices and corners that a scene may place beyond one for each two bytes of its file: nodes that place
@@ -41,23 +43,23 @@ fn fault(place: impl ToString, why: impl ToString) -> ParseError {
     }
 }
 
-/// The JSON and the binary chunk of a file of either kind.
-fn container(bytes: &[u8]) -> Result<(Document, Option<Vec<u8>>), ParseError> {
+/// The JSON and the binary chunk of a file.
+type Chunks<'a> = (Cow<'a, [u8]>, Option<Cow<'a, [u8]>>);
+
+/// The chunks of a file of either kind.
+fn container(bytes: &[u8]) -> Result<Chunks<'_>, ParseError> {
     if bytes.starts_with(b"glTF") {
         // The crate subtracts the length of the header from that of the file.
-        if bytes
-            .get(8..12)
-            .is_none_or(|length| length < &[12, 0, 0, 0][..] && length[1..] == [0; 3])
-        {
+        let length = bytes.get(8..12).and_then(|word| word.try_into().ok());
+        if length.map(u32::from_le_bytes).is_none_or(|n| n < 12) {
             return Err(fault("the file", "ends within its header"));
         }
         let glb = gltf::Glb::from_slice(bytes).map_err(|e| unreadable(&e))?;
-        let document = document(&glb.json)?;
-        return Ok((document, glb.bin.map(|chunk| chunk.into_owned())));
+        return Ok((glb.json, glb.bin));
     }
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     if text.trim_ascii_start().starts_with(b"{") {
-        return Ok((document(text)?, None));
+        return Ok((Cow::Borrowed(text), None));
     }
     Err(ParseError::BadHeader {
         found: shown(&bytes[..bytes.len().min(8)]),
@@ -75,6 +77,12 @@ fn unreadable(error: &gltf::Error) -> ParseError {
     }
 }
 
+fn no_json(error: &json::Error) -> ParseError {
+    ParseError::Json {
+        reason: error.to_string(),
+    }
+}
+
 /// A document in which every index that leads to triangles is in range.
 fn document(text: &[u8]) -> Result<Document, ParseError> {
     let n_objects = text.iter().filter(|&&b| b == b'{').count();
@@ -84,9 +92,7 @@ fn document(text: &[u8]) -> Result<Document, ParseError> {
             format_args!("has {n_objects} objects, but at most {MAX_OBJECTS} are read"),
         ));
     }
-    let root: Root = json::deserialize::from_slice(text).map_err(|e| ParseError::Json {
-        reason: e.to_string(),
-    })?;
+    let root: Root = json::deserialize::from_slice(text).map_err(|e| no_json(&e))?;
     if !root.asset.version.starts_with("2.") {
         return Err(ParseError::Unsupported {
             what: format!("glTF {}", shown(root.asset.version.as_bytes())),
@@ -263,7 +269,9 @@ fn roots(document: &Document) -> Vec<Node<'_>> {
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
-    let (document, binary) = container(bytes)?;
+    let (text, binary) = container(bytes)?;
+    let document = document(&text)?;
+    let transforms = transforms::read(&text).map_err(|e| no_json(&e))?;
     let mut scene = Scene {
         buffers: Buffers::new(&document, binary.as_deref()),
         polygons: Polygons::new(Vec::new()),
@@ -281,7 +289,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
                 "is reached twice, but nodes must form a tree",
             ));
         }
-        let transform = outer * Matrix4::from(node.transform().matrix()).cast();
+        let transform = outer * transforms[node.index()];
         if let Some(mesh) = node.mesh() {
             let mut bases = BTreeMap::new();
             for primitive in mesh.primitives() {
