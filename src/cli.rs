@@ -1,10 +1,12 @@
 //! What was typed becomes one command with typed flags.
 
 mod care;
+mod carrying;
 mod corrections;
 mod looking;
 
 pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
+pub(crate) use carrying::{Map, Transfer};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
 
@@ -118,6 +120,8 @@ pub(crate) enum Command {
     View(View),
     /// Show the functional map from one shape to another and which parts it matches
     Map(Map),
+    /// Carry labels or functions at the faces of one shape to those of another
+    Transfer(Transfer),
     /// List the shapes most like one shape
     Nearest(Nearest),
     /// Remove shapes
@@ -404,40 +408,6 @@ pub(crate) enum ExportFormat {
     Json,
     /// NAME.seg: as labels, under the name that Princeton's tools expect
     Seg,
-}
-
-/// `coseg map`
-#[derive(Debug, Args)]
-pub(crate) struct Map {
-    /// Functions are carried from this shape
-    pub(crate) from: String,
-    /// Functions are carried to this shape
-    pub(crate) to: String,
-    #[command(flatten)]
-    pub(crate) within: InCollection,
-    /// Write c_12 and p2p_21 to this safetensors file
-    #[arg(long, short, value_name = "FILE")]
-    pub(crate) out: Option<PathBuf>,
-    /// Draw both shapes, with colours carried over, and the entries of c_12 to this PNG file
-    #[arg(long, value_name = "FILE")]
-    pub(crate) png: Option<PathBuf>,
-    /// A map between points, computed now, in place of the one that carries labels
-    #[arg(long)]
-    pub(crate) points: bool,
-    /// With --points: the map that takes left for right
-    #[arg(long, requires = "points")]
-    pub(crate) mirrored: bool,
-    /// With --points: proxy vertices of both shapes that correspond, as FROM:TO; may be given again
-    #[arg(long, requires = "points", value_name = "FROM:TO", value_parser = landmark)]
-    pub(crate) landmark: Vec<(u32, u32)>,
-}
-
-/// `FROM:TO`, two vertices.
-fn landmark(text: &str) -> Result<(u32, u32), String> {
-    let parsed = text
-        .split_once(':')
-        .and_then(|(from, to)| Some((from.parse().ok()?, to.parse().ok()?)));
-    parsed.ok_or_else(|| format!("{text:?} is not FROM:TO, two vertex numbers"))
 }
 
 /// `coseg nearest`

@@ -45,10 +45,10 @@ pub(crate) struct Category {
 /// One mesh.
 pub(crate) struct Known {
     name: String,
-    bytes: Bytes,
-    format: wire::MeshFormat,
-    mesh: TriMesh,
-    truth: Vec<i32>,
+    pub(crate) bytes: Bytes,
+    pub(crate) format: wire::MeshFormat,
+    pub(crate) mesh: TriMesh,
+    pub(crate) truth: Vec<i32>,
 }
 
 /// What came of one order of arrival.

@@ -1,7 +1,8 @@
 //! `coseg bench maps`: how good maps between points are on meshes whose correspondence is known.
 
+use super::bench_made::{self, Change};
 use super::session::{print_line, table};
-use super::{CommandError, Outcome};
+use super::{CommandError, Outcome, bench_carry};
 use crate::cli::Global;
 use clap::Args;
 use coseg::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
@@ -23,18 +24,28 @@ const MAX_POINTS: usize = 500;
 pub(crate) struct BenchMaps {
     /// Folder with folders of meshes: NAME.off, and NAME.vts, whose line i is the number, from 1, of the vertex at point i;
     /// perhaps NAME.sym.vts, where that point lies mirrored. Meshes whose names begin with the same letters make a set
-    #[arg(long, value_name = "DIR")]
-    data: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["labels", "pair"])]
+    data: Option<PathBuf>,
+    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with one integer a face. Measures
+    /// how well maps carry labels, in the place of points
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["data", "pair"])]
+    labels: Option<PathBuf>,
+    /// With --labels: only these categories [default: all]
+    #[arg(long, value_name = "NAME", requires = "labels")]
+    category: Vec<String>,
     /// Two meshes and a file that has, for each vertex of the second, the number of a vertex of the first, from 0
     #[arg(long, num_args = 3, value_names = ["FROM.off", "TO.off", "TRUTH"])]
     pair: Option<Vec<PathBuf>>,
     /// Only every Nth pair
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     stride: u32,
+    /// Of the pairs of --data, change one shape: cut a part away, add a component, add a handle
+    #[arg(long, requires = "data")]
+    made: bool,
 }
 
 /// A mesh with its spectrum; of area 1, and with the vertices of its file.
-struct Meshed {
+pub(super) struct Meshed {
     vertices: Vec<[f32; 3]>,
     faces: Vec<[u32; 3]>,
     graph: EdgeGraph,
@@ -44,7 +55,7 @@ struct Meshed {
 }
 
 /// Vertices at the known points of a mesh, and where these lie mirrored.
-struct Known {
+pub(super) struct Known {
     at: Vec<u32>,
     mirrored: Vec<u32>,
     /// Distances from the points at which errors are taken, with which points these are.
@@ -52,17 +63,26 @@ struct Known {
 }
 
 /// Errors of one map, in units of the square root of the area.
-struct Score {
+pub(super) struct Score {
     counted: f64,
     forgiven: f64,
     expected: f64,
     estimate_ms: f64,
+    /// Of samples and probe functions, a shape.
+    frame_ms: f64,
 }
 
 pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
+    if let Some(labels) = &args.labels {
+        return bench_carry::run(labels, &args.category, global);
+    }
     let mut rows = Vec::new();
     let mut scores = Vec::new();
-    for (set, files) in sets(&args.data)? {
+    let sets = args.data.as_deref().map(sets).transpose()?;
+    if args.made {
+        return made(&sets.unwrap_or_default(), args.stride as usize, global);
+    }
+    for (set, files) in sets.unwrap_or_default() {
         let found = bench_set(&files, args.stride as usize)?;
         if !global.json {
             eprintln!("{set}: {} pairs", found.len());
@@ -84,7 +104,7 @@ pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
     if global.json {
         let sets: Vec<_> = rows
             .iter()
-            .map(|(set, m)| json!({"set": set, "pairs": m.0, "counted": m.1, "forgiven": m.2, "estimate_ms": m.3}))
+            .map(|(set, m)| json!({"set": set, "pairs": m.0, "counted": m.1, "forgiven": m.2, "estimate_ms": m.3, "frame_ms": m.4}))
             .collect();
         let bins: Vec<_> = calibration
             .iter()
@@ -121,8 +141,46 @@ pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
     Ok(true)
 }
 
+/// Pairs of which one shape is changed.
+fn made(sets: &BTreeMap<String, Vec<PathBuf>>, stride: usize, global: &Global) -> Outcome {
+    let mut lines = Vec::new();
+    for (set, files) in sets {
+        for (change, name) in Change::ALL {
+            let (scores, masked) = bench_made::bench(files, change, stride, &options())?;
+            lines.push((set, name, mean(&scores), masked.figures()));
+        }
+    }
+    if global.json {
+        let rows = lines.iter().map(|(set, change, m, f)| {
+            json!({"set": set, "change": change, "pairs": m.0, "counted": m.1, "forgiven": m.2,
+                   "precision": f[0], "recall": f[1], "said": f[2]})
+        });
+        print_line(&json!(rows.collect::<Vec<_>>()).to_string())?;
+        return Ok(true);
+    }
+    let head = [
+        "set",
+        "change",
+        "pairs",
+        "error",
+        "mirror forgiven",
+        "precision",
+        "recall",
+        "said",
+    ];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    rows.extend(lines.iter().map(|(set, change, m, f)| {
+        let mut row = vec![(*set).clone(), (*change).to_owned(), m.0.to_string()];
+        row.extend([m.1, m.2].map(|x| format!("{x:.4}")));
+        row.extend(f.map(|x| format!("{x:.3}")));
+        row
+    }));
+    print_line(&table(&rows))?;
+    Ok(true)
+}
+
 /// Pairs, mean error, mean forgiven error, mean time.
-fn mean(scores: &[Score]) -> (usize, f64, f64, f64) {
+fn mean(scores: &[Score]) -> (usize, f64, f64, f64, f64) {
     let over =
         |f: &dyn Fn(&Score) -> f64| scores.iter().map(f).sum::<f64>() / scores.len().max(1) as f64;
     (
@@ -130,6 +188,7 @@ fn mean(scores: &[Score]) -> (usize, f64, f64, f64) {
         over(&|s| s.counted),
         over(&|s| s.forgiven),
         over(&|s| s.estimate_ms),
+        over(&|s| s.frame_ms),
     )
 }
 
@@ -190,7 +249,7 @@ fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, CommandError> {
     Ok(sets)
 }
 
-fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, CommandError> {
+pub(super) fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, CommandError> {
     let text = std::fs::read_to_string(path).map_err(|source| CommandError::File {
         path: path.display().to_string(),
         source,
@@ -203,6 +262,11 @@ fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, CommandError> {
 }
 
 fn load(path: &Path) -> Result<Meshed, CommandError> {
+    let failed = |e: CommandError| CommandError::Failed(format!("{}: {e}", path.display()));
+    meshed(load_mesh(path)?).map_err(failed)
+}
+
+pub(super) fn load_mesh(path: &Path) -> Result<TriMesh, CommandError> {
     let failed =
         |e: &dyn std::fmt::Display| CommandError::Failed(format!("{}: {e}", path.display()));
     let bytes = std::fs::read(path).map_err(|source| CommandError::File {
@@ -210,10 +274,15 @@ fn load(path: &Path) -> Result<Meshed, CommandError> {
         source,
     })?;
     let parsed = mesh::parse(&bytes, Format::Off).map_err(|e| failed(&e))?;
-    let mut whole = TriMesh {
+    Ok(TriMesh {
         vertices: parsed.vertices,
         faces: parsed.triangles,
-    };
+    })
+}
+
+/// The mesh scaled to area 1, with its spectrum.
+pub(super) fn meshed(mut whole: TriMesh) -> Result<Meshed, CommandError> {
+    let failed = |e: &dyn std::fmt::Display| CommandError::Failed(e.to_string());
     let area: f64 = FaceGeometry::new(&whole).areas.iter().sum();
     let scale = area.sqrt().recip();
     whole
@@ -242,7 +311,7 @@ fn load(path: &Path) -> Result<Meshed, CommandError> {
 }
 
 impl Meshed {
-    fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
+    pub(super) fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
         let basis = Basis {
             eigenvalues: &self.eigenvalues,
             eigenvectors: &self.eigenvectors,
@@ -253,7 +322,7 @@ impl Meshed {
     }
 
     /// Distances from points spread evenly over `at`.
-    fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
+    pub(super) fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
         let count = at.len().min(MAX_POINTS);
         let points = (0..count).map(|i| i * at.len() / count);
         let distances = points.map(|p| (p, self.graph.dijkstra(at[p]))).collect();
@@ -283,21 +352,25 @@ fn errors(from: &Known, to: &Known, map: &PointMap) -> (f64, f64) {
     (direct, direct.min(error(&to.mirrored)))
 }
 
-fn scored(
+pub(super) fn scored(
     one: (&PointShape<'_>, &Known),
     two: (&PointShape<'_>, &Known),
     options: &EstimateOptions,
-) -> Score {
+) -> (Score, PointMap) {
     let begin = Instant::now();
     let maps = point_maps(one.0, two.0, &[], options);
     let estimate_ms = begin.elapsed().as_secs_f64() * 1e3;
-    let (counted, forgiven) = errors(one.1, two.1, &maps[0]);
-    Score {
+    let map = maps.into_iter().next();
+    let map = map.expect("invariant: there is a map between any two shapes");
+    let (counted, forgiven) = errors(one.1, two.1, &map);
+    let score = Score {
         counted,
         forgiven,
-        expected: maps[0].expected_error,
+        expected: map.expected_error,
         estimate_ms,
-    }
+        frame_ms: 0.0,
+    };
+    (score, map)
 }
 
 fn options() -> EstimateOptions {
@@ -331,7 +404,7 @@ fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, CommandErro
     let pairs = (0..n).flat_map(|i| (0..n).filter(move |j| *j != i).map(move |j| (i, j)));
     let scores = pairs.step_by(stride).map(|(i, j)| {
         let ((a, known_a), (b, known_b)) = (&shapes[i], &shapes[j]);
-        scored((a, known_a), (b, known_b), &options)
+        scored((a, known_a), (b, known_b), &options).0
     });
     Ok(scores.collect())
 }
@@ -342,12 +415,15 @@ fn bench_pair(from: &Path, to: &Path, truth: &Path) -> Result<Score, CommandErro
     let (one, two) = (load(from)?, load(to)?);
     let truth = numbers(truth, 0)?;
     let all = (0..truth.len() as u32).collect();
+    let begin = Instant::now();
     let (a, b) = (one.shape(&options), two.shape(&options));
+    let frame_ms = begin.elapsed().as_secs_f64() * 1e3 / 2.0;
     let known = one.known(truth, Vec::new());
     let target = Known {
         at: all,
         mirrored: Vec::new(),
         distances: Vec::new(),
     };
-    Ok(scored((&a, &known), (&b, &target), &options))
+    let (score, _) = scored((&a, &known), (&b, &target), &options);
+    Ok(Score { frame_ms, ..score })
 }

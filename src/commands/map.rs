@@ -17,13 +17,18 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         collection: collection.clone(),
         from: args.from.clone(),
         to: args.to.clone(),
-        points: args.points.then(|| points(args)),
+        points: args.points.then(|| options(&args.landmark, args.mirrored)),
     };
     let (map, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
     if let Some(path) = &args.out {
         write_arrays(
             path,
-            &[("c_12", &map.c_12), ("p2p_21", &map.p2p_21)],
+            &[
+                ("c_12", &map.c_12),
+                ("p2p_21", &map.p2p_21),
+                ("matched", &map.matched),
+                ("confidence", &map.confidence),
+            ],
             &frames,
         )?;
     }
@@ -85,6 +90,7 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         quality.coverage,
         quality.near_zero
     ))?;
+    session.line(&match_line(&quality))?;
     if args.points {
         session.line(&point_line(&quality, map.alternative_cost))?;
         return Ok(true);
@@ -114,15 +120,14 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
 }
 
 /// What is asked of a map between points.
-fn points(args: &Map) -> wire::PointMapOptions {
-    let orientation = if args.mirrored {
+pub(super) fn options(landmarks: &[(u32, u32)], mirrored: bool) -> wire::PointMapOptions {
+    let orientation = if mirrored {
         wire::MapOrientation::Reverse
     } else {
         wire::MapOrientation::Unspecified
     };
     wire::PointMapOptions {
-        landmarks: args
-            .landmark
+        landmarks: landmarks
             .iter()
             .map(|&(from, to)| wire::Landmark { from, to })
             .collect(),
@@ -130,6 +135,21 @@ fn points(args: &Map) -> wire::PointMapOptions {
         k: 0,
         alternative: true,
     }
+}
+
+/// To how much something corresponds, and how much of what labels say is to be believed.
+pub(super) fn match_line(q: &wire::MapQuality) -> String {
+    let mut line = format!(
+        "something corresponds to {:.1} % of the second",
+        100.0 * q.matched()
+    );
+    if let Some(confidence) = q.confidence {
+        line += &format!(
+            "; a carried label is expected to be right on {:.1} %",
+            100.0 * confidence
+        );
+    }
+    line
 }
 
 /// What is known of a map between points besides, and of its alternative.

@@ -2,8 +2,11 @@
 
 mod add;
 pub(crate) mod bench;
+mod bench_carry;
 mod bench_labels;
+mod bench_made;
 mod bench_maps;
+mod bench_partial;
 mod bench_signatures;
 mod check;
 mod collections;
@@ -36,7 +39,9 @@ mod stop;
 mod suggest;
 pub(crate) mod synth;
 mod top;
+mod transfer;
 mod undo;
+mod values;
 mod view;
 mod wait;
 mod watch;
@@ -178,6 +183,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Export(args) => export::run(args, session()?),
         Command::Render(args) => render::run(args, session()?),
         Command::Map(args) => map::run(args, session()?),
+        Command::Transfer(args) => transfer::run(args, session()?),
         Command::Nearest(args) => nearest::run(args, session()?),
         Command::Rm(args) => rm::run(args, session()?),
         Command::Watch(args) => watch::run(args, session()?),

@@ -165,6 +165,16 @@ impl Frame {
     }
 }
 
+impl Frame {
+    /// The last, finest level.
+    ///
+    /// # Panics
+    /// If it was made with options that have no stage.
+    pub fn last(&self) -> &Level {
+        self.levels.last().expect("invariant: there is a stage")
+    }
+}
+
 impl Level {
     fn new(samples: Samples, basis: &Basis<'_>, probes: &Probes, k: usize) -> Self {
         let dim = probes.dim;

@@ -6,12 +6,16 @@
 
 pub mod basis;
 pub mod bijective;
+pub mod confidence;
+pub mod consistency;
 pub mod convert;
 pub mod estimate;
 pub mod icp;
 pub mod landmarks;
+pub mod latent;
 pub mod operators;
 pub mod orientation;
+pub mod parts;
 pub mod points;
 pub mod precise;
 pub mod probes;
@@ -24,10 +28,14 @@ pub mod transfer;
 mod zoomout;
 
 pub use basis::Basis;
+pub use confidence::Confidence;
 pub use estimate::{EstimateOptions, Side};
+pub use parts::{
+    MapOptions, MapShape, descriptor_zoomout, descriptor_zoomout_from, nearest_descriptors,
+};
 pub use points::{PointMap, PointShape, point_maps};
 pub use quality::{Assessment, Quality};
-pub use zoomout::{MapOptions, MapShape, descriptor_zoomout, zoomout, zoomout_sampled};
+pub use zoomout::{zoomout, zoomout_sampled};
 
 /// A functional map with its pointwise map and its quality.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,6 +48,8 @@ pub struct FunctionalMap {
     pub k2: usize,
     /// For each vertex of shape 2 a vertex of shape 1.
     pub p2p_21: Vec<u32>,
+    /// What to expect of it at each vertex of shape 2, and where nothing corresponds.
+    pub confidence: Confidence,
     /// How good it is.
     pub quality: Quality,
 }

@@ -1,10 +1,15 @@
 //! Two shapes become a map between their points, its mirrored alternative, and what to expect of both.
 
 use super::basis::Basis;
+use super::bijective::Hints;
 use super::estimate::{Candidate, EstimateOptions, Frame, dense, estimate};
 use super::landmarks::landmark_probes;
-use super::quality::{Assessment, Quality};
+use super::quality::{Assessment, Quality, returned};
 use crate::mesh::{EdgeGraph, TriMesh, bridges};
+
+/// A point of shape 2 that is mapped to shape 1 and from there back comes no farther from where it was, in units of the
+/// square root of the area, if something corresponds to it.
+const FARTHEST_RETURN: f32 = 0.12;
 
 /// A shape of area 1 between whose points and those of others maps are made.
 #[derive(Debug, Clone)]
@@ -49,6 +54,8 @@ pub struct PointMap {
     pub k: usize,
     /// For each vertex of shape 2 a vertex of shape 1.
     pub p2p_21: Vec<u32>,
+    /// For each vertex of shape 2 whether something corresponds to it.
+    pub matched: Vec<bool>,
     /// The descriptor residual is that of the probe functions: 0 is perfect, 2 is chance.
     pub quality: Quality,
     /// Round trip and smoothness.
@@ -90,21 +97,33 @@ fn finished(one: &PointShape<'_>, two: &PointShape<'_>, found: Candidate) -> Poi
     let expected_error = expected_error(&found);
     let p2p_21 = dense((&one.basis, &one.frame), &two.basis, &found.pair);
     let k = found.pair.k;
+    let (from, to) = (one.frame.last(), two.frame.last());
+    let between = found
+        .pair
+        .pointwise(&from.basis, &to.basis, &Hints::default());
+    let returns = returned((two.vertices, &to.samples), (&between.0, &between.1));
+    let nearest = to.samples.nearest.iter();
+    let matched: Vec<bool> = nearest
+        .map(|s| returns[*s as usize] <= FARTHEST_RETURN)
+        .collect();
+    let of_matched = two.basis.mass.iter().zip(&matched).filter(|x| *x.1);
+    let total: f32 = two.basis.mass.iter().sum();
     PointMap {
         quality: Quality {
             descriptor_residual: found.residual,
+            matched: f64::from(of_matched.map(|(m, _)| m).sum::<f32>() / total.max(1e-30)),
             ..Quality::of_map(one.basis.mass, &found.pair.c_12, k, &p2p_21)
         },
         assessment: Assessment::new(
-            (&one.basis, one.vertices),
-            (&two.basis, two.vertices, two.faces),
-            &found.pair.c_12,
-            k,
+            (one.vertices, &from.samples),
+            (two.vertices, two.faces),
+            (&between.0, &between.1),
             &p2p_21,
         ),
         c_12: found.pair.c_12,
         k,
         p2p_21,
+        matched,
         orientation: found.agreement,
         expected_error,
         cost: found.cost,

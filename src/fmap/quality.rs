@@ -1,11 +1,7 @@
 //! A map becomes figures that say how far it can be trusted.
 
-use super::basis::{Basis, product, transposed_product};
-use super::zoomout::MapShape;
-use crate::linalg::nearest::nearest_rows;
-
-/// Vertices that are sent there and back, spread evenly over the numbering.
-const MAX_RETURNED: usize = 500;
+use super::basis::transposed_product;
+use super::samples::Samples;
 
 /// How good a map is, as kept with it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -18,13 +14,20 @@ pub struct Quality {
     pub coverage: f64,
     /// Share of entries of C with magnitude below 0.1 (Yang and Tian report at least 0.9).
     pub near_zero: f64,
+    /// Of maps for parts: mass-weighted mean squared descriptor difference between a vertex of shape 2 and what its match
+    /// is matched with; 0 is perfect.
+    pub descriptor_return: f64,
+    /// Of maps for parts: share of the area on which a carried label is expected to be right.
+    pub confidence: f64,
+    /// Share of the mass of shape 2 to which something corresponds.
+    pub matched: f64,
 }
 
 /// What the two shapes and the map say besides, without ground truth.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Assessment {
-    /// Mean distance, in units of the square root of the area, between a vertex of shape 1 and where it comes back to
-    /// when it is mapped to shape 2 and from there by `p2p_21`.
+    /// Mean distance, in units of the square root of the area, between a sample of shape 1 and where it comes back to
+    /// when it is mapped to shape 2 and from there back.
     pub round_trip: f64,
     /// Dirichlet energy of the coordinates of shape 1 carried to shape 2 over that of shape 2's own: near 1 for a
     /// smooth map, large for a torn one.
@@ -32,34 +35,7 @@ pub struct Assessment {
 }
 
 impl Quality {
-    /// Of a map `c_12 (k2, k1)` with its pointwise map.
-    pub fn new(
-        one: &MapShape<'_>,
-        two: &MapShape<'_>,
-        c_12: &[f32],
-        k1: usize,
-        p2p_21: &[u32],
-    ) -> Self {
-        let dim = one.dim;
-        let rows = two.descriptors.chunks_exact(dim).zip(p2p_21).zip(two.mass);
-        let (mut difference, mut total) = (0.0, 0.0);
-        for ((x, t), mass) in rows {
-            let y = &one.descriptors[*t as usize * dim..(*t as usize + 1) * dim];
-            let d: f64 = x
-                .iter()
-                .zip(y)
-                .map(|(x, y)| f64::from((x - y) * (x - y)))
-                .sum();
-            difference += f64::from(*mass) * d;
-            total += f64::from(*mass);
-        }
-        Self {
-            descriptor_residual: difference / f64::max(total, 1e-300),
-            ..Self::of_map(one.mass, c_12, k1, p2p_21)
-        }
-    }
-
-    /// The same but for the descriptor residual, which stays 0.
+    /// What a map `c_12 (k2, k1)` and its pointwise map say by themselves; what takes descriptors stays 0.
     pub fn of_map(mass_1: &[f32], c_12: &[f32], k1: usize, p2p_21: &[u32]) -> Self {
         let k2 = c_12.len() / k1.max(1);
         let gram = transposed_product(c_12, c_12, k2, k1, k1);
@@ -78,43 +54,49 @@ impl Quality {
             covered += if *hit { f64::from(*mass) } else { 0.0 };
         }
         Self {
-            descriptor_residual: 0.0,
             orthogonality: (departure / k1.max(1) as f64).sqrt(),
             coverage: covered / f64::max(total, 1e-300),
             near_zero: small as f64 / c_12.len().max(1) as f64,
+            matched: 1.0,
+            ..Self::default()
         }
     }
 }
 
 impl Assessment {
-    /// Of a map `c_12 (k2, k1)` with its pointwise map, between shapes of area 1. One nearest-neighbour search.
+    /// Of a map between shapes of area 1, between whose samples the maps there and back are `p2p_21` and `p2p_12`, and all
+    /// of whose vertices are mapped by `dense_21`.
     pub fn new(
-        one: (&Basis<'_>, &[[f32; 3]]),
-        two: (&Basis<'_>, &[[f32; 3]], &[[u32; 3]]),
-        c_12: &[f32],
-        k1: usize,
-        p2p_21: &[u32],
+        one: (&[[f32; 3]], &Samples),
+        two: (&[[f32; 3]], &[[u32; 3]]),
+        (p2p_21, p2p_12): (&[u32], &[u32]),
+        dense_21: &[u32],
     ) -> Self {
-        let k2 = c_12.len() / k1.max(1);
-        // The map back by the same C: some rows of Φ₁ against those of Φ₂ C.
-        let step = one.0.n_vertices().div_ceil(MAX_RETURNED).max(1);
-        let vertices: Vec<u32> = (0..one.0.n_vertices() as u32).step_by(step).collect();
-        let targets = product(&two.0.leading(k2), c_12, two.0.n_vertices(), k2, k1);
-        let back = nearest_rows(&one.0.rows(&vertices, k1), &targets, k1);
-        let (mut sum, mut total) = (0.0, 0.0);
-        for (&v, there) in vertices.iter().zip(&back) {
-            let (a, b) = (one.1[v as usize], one.1[p2p_21[*there as usize] as usize]);
-            let d: f32 = (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
-            sum += f64::from(one.0.mass[v as usize] * d);
-            total += f64::from(one.0.mass[v as usize]);
-        }
-        let carried = |v: u32| one.1[p2p_21[v as usize] as usize];
-        let own = dirichlet(two.2, two.1, |v| two.1[v as usize]);
+        let returns = returned(one, (p2p_12, p2p_21));
+        let weighted = returns.iter().zip(&one.1.mass);
+        let sum: f64 = weighted.map(|(d, m)| f64::from(d * m)).sum();
+        let total: f64 = one.1.mass.iter().map(|m| f64::from(*m)).sum();
+        let carried = |v: u32| one.0[dense_21[v as usize] as usize];
+        let own = dirichlet(two.1, two.0, |v| two.0[v as usize]);
         Self {
-            round_trip: sum / f64::max(total, 1e-300),
-            smoothness: dirichlet(two.2, two.1, carried) / own.max(1e-300),
+            round_trip: sum / total.max(1e-300),
+            smoothness: dirichlet(two.1, two.0, carried) / own.max(1e-300),
         }
     }
+}
+
+/// How far each sample of a shape is from where it comes back to by the maps between samples there and back.
+pub(super) fn returned(
+    (vertices, samples): (&[[f32; 3]], &Samples),
+    (there, back): (&[u32], &[u32]),
+) -> Vec<f32> {
+    let at = |s: u32| vertices[samples.vertices[s as usize] as usize];
+    let ways = there.iter().enumerate();
+    ways.map(|(s, t)| {
+        let (a, b) = (at(s as u32), at(back[*t as usize]));
+        (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt()
+    })
+    .collect()
 }
 
 /// Dirichlet energy of three functions on a mesh; triangles without area are left out.

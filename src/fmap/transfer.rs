@@ -31,12 +31,14 @@ pub fn carried(
 }
 
 /// Values at faces `(m1, dim)` of shape 1 become values at faces `(m2, dim)` of shape 2: of each face, the mean over its
-/// corners of the mean over the faces around the matched vertices. Labels and other classes go as indicators.
+/// corners of the mean over the faces around the matched vertices. Labels and other classes go as indicators. `matched
+/// (n2,)` says to which vertices something corresponds; a face with fewer than two such corners gets NaN.
 pub fn faces_to_faces(
     faces_1: &[[u32; 3]],
     faces_2: &[[u32; 3]],
     n_1: usize,
     p2p_21: &[u32],
+    matched: &[bool],
     values: &[f32],
     dim: usize,
 ) -> Vec<f32> {
@@ -56,21 +58,28 @@ pub fn faces_to_faces(
     }
     let mut out = Vec::with_capacity(faces_2.len() * dim);
     for face in faces_2 {
-        let corners = face.map(|v| p2p_21[v as usize] as usize * dim);
-        out.extend(
-            (0..dim).map(|c| corners.iter().map(|at| at_vertices[at + c]).sum::<f32>() / 3.0),
-        );
+        let corners = face.iter().filter(|v| matched[**v as usize]);
+        let corners: Vec<usize> = corners
+            .map(|v| p2p_21[*v as usize] as usize * dim)
+            .collect();
+        if corners.len() < 2 {
+            out.extend(std::iter::repeat_n(f32::NAN, dim));
+            continue;
+        }
+        let n = corners.len() as f32;
+        out.extend((0..dim).map(|c| corners.iter().map(|at| at_vertices[at + c]).sum::<f32>() / n));
     }
     out
 }
 
 /// The label of each face of shape 2 `(m2,)` that most of the faces around the vertices matched to its corners have;
-/// the lowest on ties.
+/// the lowest on ties; −1 where nothing corresponds.
 pub fn labels_to_faces(
     faces_1: &[[u32; 3]],
     faces_2: &[[u32; 3]],
     n_1: usize,
     p2p_21: &[u32],
+    matched: &[bool],
     labels: &[i32],
 ) -> Vec<i32> {
     let mut kinds = labels.to_vec();
@@ -81,8 +90,11 @@ pub fn labels_to_faces(
         .iter()
         .flat_map(|l| kinds.iter().map(move |k| f32::from(u8::from(k == l))))
         .collect();
-    let votes = faces_to_faces(faces_1, faces_2, n_1, p2p_21, &indicators, dim);
+    let votes = faces_to_faces(faces_1, faces_2, n_1, p2p_21, matched, &indicators, dim);
     let most = |row: &[f32]| {
+        if row[0].is_nan() {
+            return -1;
+        }
         let mut best = 0;
         for (i, x) in row.iter().enumerate() {
             if *x > row[best] {
@@ -121,10 +133,19 @@ mod tests {
         let p2p = [5, 4, 3, 2, 1, 0];
         let labels = [7, 7, 2, 2];
         assert_eq!(
-            labels_to_faces(&faces, &faces, 6, &p2p, &labels),
+            labels_to_faces(&faces, &faces, 6, &p2p, &[true; 6], &labels),
             [2, 2, 7, 7]
         );
-        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[1.0, 1.0, 1.0, 1.0], 1);
+        let ones = [1.0, 1.0, 1.0, 1.0];
+        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[true; 6], &ones, 1);
         assert!(carried.iter().all(|x| (x - 1.0).abs() < 1e-6));
+        // Nothing corresponds to one end of the strip.
+        let matched = [false, false, true, true, true, true];
+        assert_eq!(
+            labels_to_faces(&faces, &faces, 6, &p2p, &matched, &labels),
+            [-1, 2, 7, 7]
+        );
+        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &matched, &ones, 1);
+        assert!(carried[0].is_nan() && carried[1..].iter().all(|x| (x - 1.0).abs() < 1e-6));
     }
 }

@@ -144,6 +144,9 @@ pub fn quality(q: &wire::MapQuality) -> Value {
         "smoothness": q.smoothness,
         "orientation": q.orientation,
         "expected_error": q.expected_error,
+        "matched": q.matched,
+        "descriptor_return": q.descriptor_return,
+        "confidence": q.confidence,
     })
 }
 

@@ -6,14 +6,14 @@ use super::correct::pin_polygons;
 use super::lane::Lane;
 use super::place::{Known, MAX_MAPS, Plan, next_recluster, sources_of};
 use super::relabel::{Relabelled, area_shares, cause};
-use super::rows::{Teaching, quality_from_json};
+use super::rows::{Teaching, confidence_of_row};
 use super::{LabelId, Library, Result, Source};
-use crate::fmap::{FunctionalMap, MapOptions};
+use crate::fmap::{Confidence, FunctionalMap, MapOptions};
 use crate::labels::LabelModel;
 use crate::pipeline::{
     DescriptionView, Labelling, Prepared, TeachOptions, Vote, label_taught, map, proxy_pins,
 };
-use crate::store::ShapeId;
+use crate::store::{MapRow, ShapeId};
 use rayon::prelude::*;
 
 /// Most exemplars that vote for one shape; representatives fill up to [`MAX_MAPS`].
@@ -37,7 +37,7 @@ struct Voter {
 #[derive(Debug, Clone)]
 pub(super) struct MapIn {
     pub(super) p2p_21: Vec<u32>,
-    pub(super) residual: f64,
+    pub(super) confidence: Confidence,
 }
 
 impl Library {
@@ -178,16 +178,16 @@ impl Library {
             let among: Vec<usize> = (0..lane.shapes.len())
                 .filter(|at| Some(*at) != but && wanted(*at))
                 .collect();
-            lane.nearest_among(&among, view.signature, view.n_descriptors, limit)
+            self.most_alike(lane, view, &among, limit)
         };
         let is_taught = |at: usize| teaching.taught.contains(&lane.shapes[at].ordinal);
-        let exemplars = nearest(&|at| lane.shapes[at].pinned, MAX_EXEMPLAR_VOTES);
+        let exemplars = nearest(&|at| lane.shapes[at].pinned, MAX_EXEMPLAR_VOTES)?;
         let others = nearest(
             &|at| !lane.shapes[at].pinned && is_taught(at),
             MAX_MAPS - exemplars.len(),
-        );
+        )?;
         let mut voters = Vec::new();
-        for (at, _) in exemplars.into_iter().chain(others) {
+        for at in exemplars.into_iter().chain(others) {
             let shape = &lane.shapes[at];
             if !shape.pinned {
                 let known = self.known(shape.id)?;
@@ -228,7 +228,7 @@ impl Library {
                 .catalog()
                 .read(|r| r.map(voter.known.row.id, id))?;
             kept.push(match row {
-                Some(row) => Some(MapIn::of_row(row.p2p_21, &row.quality_json)?),
+                Some(row) => Some(MapIn::of_row(row)?),
                 None => None,
             });
         }
@@ -267,13 +267,15 @@ impl MapIn {
     fn new(map: &FunctionalMap) -> Self {
         Self {
             p2p_21: map.p2p_21.clone(),
-            residual: map.quality.descriptor_residual,
+            confidence: map.confidence.clone(),
         }
     }
 
-    pub(super) fn of_row(p2p_21: Vec<u32>, quality_json: &str) -> Result<Self> {
-        let residual = quality_from_json(quality_json, "maps")?.descriptor_residual;
-        Ok(Self { p2p_21, residual })
+    pub(super) fn of_row(row: MapRow) -> Result<Self> {
+        Ok(Self {
+            confidence: confidence_of_row(&row)?,
+            p2p_21: row.p2p_21,
+        })
     }
 }
 
@@ -332,7 +334,7 @@ fn vote(
             faces: view.faces,
             probabilities: &voter.probabilities,
             p2p: &map.p2p_21,
-            residual: map.residual,
+            confidence: &map.confidence,
             trust: voter.trust,
         })
         .collect();

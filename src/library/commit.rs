@@ -231,6 +231,7 @@ pub(super) fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow
         k2: map.k2 as u32,
         c_12: map.c_12.clone(),
         p2p_21: map.p2p_21.clone(),
+        confidence: map.confidence.of_vertex.clone(),
         quality_json: quality_to_json(&map.quality),
     }
 }

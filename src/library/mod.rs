@@ -28,6 +28,7 @@
 //! # }
 //! ```
 
+mod agreement;
 mod carry;
 mod collections;
 mod commit;
@@ -50,6 +51,7 @@ mod suggest;
 mod teach;
 mod types;
 
+pub use agreement::Disagreement;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;

@@ -10,7 +10,7 @@ use crate::fmap::{FunctionalMap, MapOptions};
 use crate::labels::DiscoveryOptions;
 use crate::pipeline::{
     DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote,
-    label, map, recluster,
+    label, map, recluster, unlikeness,
 };
 use crate::store::{
     JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId, ShapeRow,
@@ -80,14 +80,15 @@ impl Library {
         let (mut maps, mut sources, mut labelling) = (Vec::new(), Vec::new(), None);
         let taught = self.place_taught(lane, &view, was_pinned)?;
         if lane.learnt.is_some() && taught.is_none() {
-            let nearest = lane.nearest(view.signature, view.n_descriptors, MAX_MAPS);
-            for &(at, _) in &nearest {
+            let all: Vec<usize> = (0..lane.shapes.len()).collect();
+            let nearest = self.most_alike(lane, &view, &all, MAX_MAPS)?;
+            for &at in &nearest {
                 n_relabelled += u32::from(self.relabel(lane, at)?);
             }
             if let Some(learnt) = &lane.learnt {
                 let known: Vec<Known> = nearest
                     .iter()
-                    .map(|(at, _)| self.known(lane.shapes[*at].id))
+                    .map(|at| self.known(lane.shapes[*at].id))
                     .collect::<Result<_>>()?;
                 let carried = carry(&view, learnt, &known);
                 sources = sources_of(&known, &carried.labelling.weights);
@@ -157,6 +158,32 @@ impl Library {
         let placed = self.commit(lane, commit, description.signature)?;
         self.note(&placed);
         Ok(placed)
+    }
+
+    /// The `limit` shapes `among` some whose maps to a shape promise most, best first: twice as many are taken by their
+    /// signatures, and compared vertex by vertex.
+    pub(super) fn most_alike(
+        &self,
+        lane: &Lane,
+        view: &DescriptionView<'_>,
+        among: &[usize],
+        limit: usize,
+    ) -> Result<Vec<usize>> {
+        let nearest = lane.nearest_among(among, view.signature, view.n_descriptors, 2 * limit);
+        let nearest: Vec<usize> = nearest.into_iter().map(|(at, _)| at).collect();
+        let Some(learnt) = lane.learnt.as_ref().filter(|_| nearest.len() > limit) else {
+            return Ok(nearest);
+        };
+        let shape = Prepared::new(view, &learnt.model);
+        let mut found = Vec::with_capacity(nearest.len());
+        for at in nearest {
+            let known = self.known(lane.shapes[at].id)?;
+            let known = Prepared::new(&known.mapped.view(), &learnt.model);
+            found.push((unlikeness(&known, &shape), at));
+        }
+        found.sort_by(|a, b| a.0.total_cmp(&b.0));
+        found.truncate(limit);
+        Ok(found.into_iter().map(|(_, at)| at).collect())
     }
 
     /// A stored shape with its arrays and newest labels.
@@ -339,7 +366,7 @@ fn carry(view: &DescriptionView<'_>, learnt: &Learnt, known: &[Known]) -> Carrie
             faces: v.faces,
             probabilities: &k.labels.proxy_probabilities,
             p2p: &m.p2p_21,
-            residual: m.quality.descriptor_residual,
+            confidence: &m.confidence,
             trust: 1.0,
         })
         .collect();

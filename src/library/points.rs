@@ -1,9 +1,17 @@
 //! Maps between the points of two stored shapes, and values carried by them.
 
+use super::rows::{from_json, to_json};
 use super::{Library, LibraryError, Result};
 use crate::fmap::transfer::{faces_to_faces, labels_to_faces};
-use crate::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
+use crate::fmap::{
+    Assessment, Basis, EstimateOptions, PointMap, PointShape, Quality, Side, point_maps,
+};
 use crate::pipeline::DescriptionView;
+use crate::store::PointMapRow;
+use serde::{Deserialize, Serialize};
+
+/// Part of the key of a kept map: raised when the same request would find another one.
+const RECIPE: u32 = 1;
 
 /// What is asked of a map between points.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -29,7 +37,7 @@ pub enum PolygonValues {
 
 impl Library {
     /// The map that carries functions on `from` to `to` point by point, and if wanted the best one of the other
-    /// orientation after it. Nothing is kept.
+    /// orientation after it. What was found is kept: the same request finds it again.
     ///
     /// # Errors
     /// There is no such shape, or a landmark is no vertex of its proxy.
@@ -40,13 +48,32 @@ impl Library {
         to: &str,
         request: &PointRequest,
     ) -> Result<Vec<PointMap>> {
-        let a = self.description(collection, from)?;
-        let b = self.description(collection, to)?;
-        maps(&a.view(), &b.view(), request)
+        let (_, a) = self.shape_row(collection, from)?;
+        let (_, b) = self.shape_row(collection, to)?;
+        let key = request_key(request);
+        let kept = self
+            .store
+            .catalog()
+            .read(|r| r.point_maps(a.id, b.id, &key).map_err(LibraryError::from))?;
+        if !kept.is_empty() {
+            return kept.into_iter().map(from_row).collect();
+        }
+        let (one, two) = (self.known(a.id)?.mapped, self.known(b.id)?.mapped);
+        let found = maps(&one.view(), &two.view(), request)?;
+        let rows: Vec<PointMapRow> = found.iter().map(to_row).collect();
+        let write = self
+            .store
+            .catalog()
+            .write(|tx| -> Result<()> { Ok(tx.put_point_maps(a.id, b.id, &key, &rows)?) });
+        // What cannot be kept, because a shape went meanwhile or the disk is full, is found again when it is asked for.
+        match write {
+            Err(LibraryError::Store(e)) if e.is_damage() => Err(e.into()),
+            _ => rows.into_iter().map(from_row).collect(),
+        }
     }
 
     /// Values at the polygons of `from` become values at those of `to`, by the map between their points: of labels the
-    /// most frequent around the matched points, of functions the mean.
+    /// most frequent around the matched points, of functions the mean; −1 and NaN where nothing corresponds.
     ///
     /// # Errors
     /// As [`Self::point_maps`]; or there is not one row for each polygon of `from`.
@@ -70,19 +97,24 @@ impl Library {
             let text = format!("values have {rows} rows, but {from:?} has {n_polygons} polygons");
             return Err(LibraryError::invalid("FIELD_RANGE", text));
         }
-        let found = maps(&one, &two, request)?.into_iter().next();
-        let map = found.expect("invariant: there is a map between any two shapes");
+        let found = self.point_maps(collection, from, to, request)?;
+        let map = found
+            .into_iter()
+            .next()
+            .expect("invariant: there is a map between any two shapes");
         let n = one.vertices.len();
         let carried = match values {
             PolygonValues::Labels(labels) => {
                 let of_face = most_frequent(&one, labels);
-                let faces = labels_to_faces(one.faces, two.faces, n, &map.p2p_21, &of_face);
+                let faces =
+                    labels_to_faces(one.faces, two.faces, n, &map.p2p_21, &map.matched, &of_face);
                 let polygons = two.face_map.iter().map(|f| faces[*f as usize]);
                 PolygonValues::Labels(polygons.collect())
             }
             PolygonValues::Functions(values, dim) => {
                 let of_face = mean(&one, values, *dim);
-                let faces = faces_to_faces(one.faces, two.faces, n, &map.p2p_21, &of_face, *dim);
+                let (p2p, matched) = (&map.p2p_21, &map.matched);
+                let faces = faces_to_faces(one.faces, two.faces, n, p2p, matched, &of_face, *dim);
                 let polygons = two.face_map.iter();
                 let rows = polygons.flat_map(|f| {
                     let at = *f as usize * dim;
@@ -93,6 +125,79 @@ impl Library {
         };
         Ok((carried, map))
     }
+}
+
+/// What is kept of a map besides its arrays.
+#[derive(Debug, Serialize, Deserialize)]
+struct Detail {
+    descriptor_residual: f64,
+    orthogonality: f64,
+    coverage: f64,
+    near_zero: f64,
+    matched: f64,
+    round_trip: f64,
+    smoothness: f64,
+    orientation: f64,
+    expected_error: f64,
+    cost: f64,
+}
+
+/// The name under which the maps that a request finds are kept.
+fn request_key(request: &PointRequest) -> String {
+    let PointRequest {
+        landmarks,
+        side,
+        k,
+        alternative,
+    } = request;
+    format!("{RECIPE} {side:?} {k} {alternative} {landmarks:?}")
+}
+
+fn to_row(map: &PointMap) -> PointMapRow {
+    let detail = Detail {
+        descriptor_residual: map.quality.descriptor_residual,
+        orthogonality: map.quality.orthogonality,
+        coverage: map.quality.coverage,
+        near_zero: map.quality.near_zero,
+        matched: map.quality.matched,
+        round_trip: map.assessment.round_trip,
+        smoothness: map.assessment.smoothness,
+        orientation: map.orientation,
+        expected_error: map.expected_error,
+        cost: map.cost,
+    };
+    PointMapRow {
+        k: map.k as u32,
+        c_12: map.c_12.clone(),
+        p2p_21: map.p2p_21.clone(),
+        matched: map.matched.iter().map(|m| u8::from(*m)).collect(),
+        detail_json: to_json(&detail),
+    }
+}
+
+fn from_row(row: PointMapRow) -> Result<PointMap> {
+    let detail: Detail = from_json(&row.detail_json, "point_maps")?;
+    Ok(PointMap {
+        c_12: row.c_12,
+        k: row.k as usize,
+        p2p_21: row.p2p_21,
+        matched: row.matched.iter().map(|m| *m > 0).collect(),
+        quality: Quality {
+            descriptor_residual: detail.descriptor_residual,
+            orthogonality: detail.orthogonality,
+            coverage: detail.coverage,
+            near_zero: detail.near_zero,
+            matched: detail.matched,
+            ..Quality::default()
+        },
+        assessment: Assessment {
+            round_trip: detail.round_trip,
+            smoothness: detail.smoothness,
+        },
+        orientation: detail.orientation,
+        expected_error: detail.expected_error,
+        cost: detail.cost,
+    })
 }
 
 fn maps(

@@ -2,7 +2,8 @@
 
 use super::relabel::face_ids;
 use super::rows::{
-    damaged, format_from_name, from_json, quality_from_json, report_from_json, to_json,
+    confidence_of_row, damaged, format_from_name, from_json, quality_from_json, report_from_json,
+    to_json,
 };
 use super::{
     Event, EventKind, LabelId, Labels, Library, LibraryError, LibraryStats, MapInfo, PartMatch,
@@ -116,12 +117,14 @@ impl Library {
             .read(|r| r.map(a.id, b.id).map_err(LibraryError::from))?;
         if let Some(m) = kept {
             let quality = quality_from_json(&m.quality_json, &format!("maps {from} {to}"))?;
+            let confidence = confidence_of_row(&m)?;
             let (k1, k2) = (m.k1 as usize, m.k2 as usize);
             return Ok(MapInfo {
                 c_12: m.c_12,
                 k2,
                 k1,
                 p2p_21: m.p2p_21,
+                confidence,
                 quality,
             });
         }
@@ -143,6 +146,7 @@ impl Library {
             k2,
             k1,
             p2p_21: found.p2p_21,
+            confidence: found.confidence,
             quality: found.quality,
         })
     }

@@ -1,5 +1,6 @@
 //! Labellings of the proxy become labels of the input, and stale shapes are labelled anew.
 
+use super::carry::MapIn;
 use super::lane::Lane;
 use super::place::{Known, Plan, sources_of};
 use super::rows::{format_from_name, to_json};
@@ -162,21 +163,18 @@ impl Library {
         let mut maps = Vec::new();
         for map in kept.into_iter().filter(|m| is_source(m.from)) {
             sources.push(self.known(map.from)?);
-            let place = format!("maps {} {}", map.from, map.to);
-            let residual =
-                super::rows::quality_from_json(&map.quality_json, &place)?.descriptor_residual;
-            maps.push((map.p2p_21, residual));
+            maps.push(MapIn::of_row(map)?);
         }
         let views: Vec<DescriptionView<'_>> = sources.iter().map(|k| k.mapped.view()).collect();
         let votes: Vec<Vote<'_>> = sources
             .iter()
             .zip(&views)
             .zip(&maps)
-            .map(|((k, v), (p2p, residual))| Vote {
+            .map(|((k, v), map)| Vote {
                 faces: v.faces,
                 probabilities: &k.labels.proxy_probabilities,
-                p2p,
-                residual: *residual,
+                p2p: &map.p2p_21,
+                confidence: &map.confidence,
                 trust: 1.0,
             })
             .collect();

@@ -10,6 +10,7 @@ use super::{Library, LibraryError, Result};
 use crate::store::check::Finding;
 use crate::store::quarantine::rebuild_indexes;
 use crate::store::{CollectionRow, Digest, ObjectKind, ShapeRow};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// What a repair did.
@@ -52,6 +53,13 @@ impl Library {
             }
         }
         done.extend(library.drop_bad_maps()?);
+        let collections: BTreeSet<&str> = rows.iter().map(|(c, _)| c.name.as_str()).collect();
+        for name in collections {
+            match library.mend_maps(name) {
+                Ok(mended) => done.extend(mended.into_iter().map(|m| format!("{name}: {m}"))),
+                Err(e) => done.push(format!("{name}: maps not mended: {e}")),
+            }
+        }
         drop(library);
         Ok(Repaired {
             done,
@@ -124,6 +132,19 @@ impl Library {
                 Err(LibraryError::Store(e)) if e.is_damage() => {
                     catalog.write(|tx| -> Result<()> { Ok(tx.delete_map(from, to)?) })?;
                     done.push(format!("maps {from}, {to}: was forgotten"));
+                }
+                _ => {}
+            }
+        }
+        let keys = catalog.read(|r| -> Result<_> { Ok(r.point_map_keys()?) })?;
+        for (from, to, request) in keys {
+            let read = catalog.read(|r| -> Result<_> { Ok(r.point_maps(from, to, &request)?) });
+            match read {
+                Err(LibraryError::Store(e)) if e.is_damage() => {
+                    catalog.write(|tx| -> Result<()> {
+                        Ok(tx.delete_point_maps(from, to, &request)?)
+                    })?;
+                    done.push(format!("point_maps {from}, {to}: were forgotten"));
                 }
                 _ => {}
             }

@@ -2,11 +2,11 @@
 
 use super::{LibraryError, Result, Up};
 use crate::description::DescriptionView;
-use crate::fmap::Quality;
+use crate::fmap::{Confidence, Quality, confidence};
 use crate::labels::{UpVote, estimate_up};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
-use crate::store::{CollectionRow, StoreError};
+use crate::store::{CollectionRow, MapRow, StoreError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -149,6 +149,9 @@ pub(super) fn quality_to_json(q: &Quality) -> String {
         "orthogonality": q.orthogonality,
         "coverage": q.coverage,
         "near_zero": q.near_zero,
+        "descriptor_return": q.descriptor_return,
+        "confidence": q.confidence,
+        "matched": q.matched,
     })
     .to_string()
 }
@@ -161,11 +164,38 @@ pub(super) fn quality_from_json(text: &str, place: &str) -> Result<Quality> {
             .and_then(Value::as_f64)
             .ok_or_else(|| damaged(place, &format!("no number {name:?}")))
     };
-    Ok(Quality {
+    let mut quality = Quality {
         descriptor_residual: number("descriptor_residual")?,
         orthogonality: number("orthogonality")?,
         coverage: number("coverage")?,
         near_zero: number("near_zero")?,
+        matched: 1.0,
+        ..Quality::default()
+    };
+    if value.get("confidence").is_some() {
+        quality.descriptor_return = number("descriptor_return")?;
+        quality.confidence = number("confidence")?;
+        quality.matched = number("matched")?;
+    } else {
+        // Kept before these were known: a typical return, so that the residual and the rest decide.
+        quality.descriptor_return = TYPICAL_RETURN;
+        quality.confidence = confidence::of_map(&quality);
+    }
+    Ok(quality)
+}
+
+/// Mean squared difference of descriptors between a vertex and what its match is matched with, of an ordinary map.
+const TYPICAL_RETURN: f64 = 0.5;
+
+/// What to expect of a kept map at each vertex.
+pub(super) fn confidence_of_row(row: &MapRow) -> Result<Confidence> {
+    if row.confidence.is_empty() {
+        let place = format!("maps {} {}", row.from, row.to);
+        let quality = quality_from_json(&row.quality_json, &place)?;
+        return Ok(Confidence::uniform(quality.confidence, row.p2p_21.len()));
+    }
+    Ok(Confidence {
+        of_vertex: row.confidence.clone(),
     })
 }
 

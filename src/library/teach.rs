@@ -190,7 +190,7 @@ impl Library {
                 let (a, b) = (known[from].row.id, known[to].row.id);
                 let row = self.store.catalog().read(|r| r.map(a, b))?;
                 let row = row.ok_or_else(|| damaged("maps", &format!("{a} to {b} is gone")))?;
-                maps.push((from, to, MapIn::of_row(row.p2p_21, &row.quality_json)?));
+                maps.push((from, to, MapIn::of_row(row)?));
             }
         }
         let pupils = self.pupils(lane, &teaching, chosen, known, &model.labels)?;
@@ -214,7 +214,7 @@ impl Library {
                 from: *from,
                 to: *to,
                 p2p: &m.p2p_21,
-                residual: m.residual,
+                confidence: &m.confidence,
             })
             .collect();
         let statistics = self.given(lane, &teaching, chosen, &model)?;

@@ -448,6 +448,8 @@ pub struct MapInfo {
     pub k1: usize,
     /// `p2p_21 (n2,)`: for each proxy vertex of `to` a proxy vertex of `from`.
     pub p2p_21: Vec<u32>,
+    /// What to expect of it at each proxy vertex of `to`, and where nothing corresponds.
+    pub confidence: crate::fmap::Confidence,
     /// How good it is.
     pub quality: crate::fmap::Quality,
 }

@@ -11,8 +11,9 @@
 //! One exemplar shows what its parts are like, but not how much like parts of different shapes differ. That is taken from
 //! the labels that were discovered before: wrong as some are, descriptors scatter within them as within true parts.
 
-use super::place::{FLOOR, carried};
+use super::place::{blended, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
+use crate::fmap::Confidence;
 use crate::labels::cut::cut;
 use crate::labels::{Classifier, Statistics};
 use nalgebra::DMatrix;
@@ -81,8 +82,8 @@ pub struct LessonMap<'a> {
     pub to: usize,
     /// For each vertex of `to` a vertex of `from`.
     pub p2p: &'a [u32],
-    /// Descriptor residual of the map.
-    pub residual: f64,
+    /// What to expect of the map at each vertex of `to`.
+    pub confidence: &'a Confidence,
 }
 
 /// What the representatives have learnt.
@@ -146,7 +147,7 @@ pub fn teach(
                         faces: lessons[m.from].shape.faces,
                         probabilities: &votes[m.from],
                         p2p: m.p2p,
-                        residual: m.residual,
+                        confidence: m.confidence,
                         trust: if lessons[m.from].pinned.is_empty() {
                             1.0
                         } else {
@@ -295,18 +296,7 @@ fn labelled(
 ) -> Labelling {
     let log_model = evidence.classifier.log_probabilities(&prepared.features);
     let (carried, weights) = carried(shape, evidence.votes, k);
-    let share = evidence.vote_share;
-    let unary: Vec<f64> = log_model
-        .iter()
-        .enumerate()
-        .map(|(i, log)| {
-            let learnt = -log.max(FLOOR.ln());
-            match carried.get(i) {
-                Some(p) => -share * p.max(FLOOR).ln() + (1.0 - share) * learnt,
-                None => learnt,
-            }
-        })
-        .collect();
+    let unary = blended(&log_model, &carried, evidence.vote_share, k);
     let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);
     let classes = cut(&prepared.surface, &unary, k, strength, fixed);
     let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();

@@ -15,7 +15,9 @@ pub use exemplars::{
     Given, Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach,
 };
 pub use literal::literal;
-pub use place::{Labelling, Prepared, Vote, label, map};
+pub use place::{
+    Labelling, Prepared, Vote, carried, label, map, map_by_descriptors, map_from, unlikeness,
+};
 pub use recluster::{
     LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, batch, recluster,
 };

@@ -2,9 +2,13 @@
 //! shapes, weighed against what the collection has learnt of its labels, and cut along creases.
 
 use super::DescriptionView;
-use crate::fmap::{FunctionalMap, MapOptions, MapShape, descriptor_zoomout};
+use crate::fmap::{
+    Confidence, FunctionalMap, MapOptions, MapShape, descriptor_zoomout, descriptor_zoomout_from,
+    nearest_descriptors,
+};
 use crate::labels::cut::cut;
 use crate::labels::{Features, LabelModel, Statistics};
+use crate::linalg::nearest::nearest_rows;
 use crate::segmentation::Surface;
 
 /// Probabilities below this count as this: one source must not veto what all others say.
@@ -13,8 +17,10 @@ pub(super) const FLOOR: f64 = 0.02;
 const VOTE_SHARE: f64 = 0.5;
 /// Boundary strength of the cut.
 const STRENGTH: f64 = 3.0;
-/// A vote loses weight with the descriptor residual of its map, relative to the best one's.
-const RESIDUAL_SCALE: f64 = 0.3;
+/// A vote weighs, at each vertex, this power of the odds that it is right there.
+const ODDS_POWER: f64 = 2.0;
+/// Confidence beyond which nobody is believed more, or less than one minus which, less.
+const MOST_CERTAIN: f64 = 0.98;
 
 /// A shape with what labelling derives from its description under a label model.
 #[derive(Debug, Clone)]
@@ -44,9 +50,11 @@ impl Prepared {
 
     fn map_shape<'a>(&'a self, shape: &DescriptionView<'a>) -> MapShape<'a> {
         MapShape {
+            eigenvalues: shape.eigenvalues,
             eigenvectors: shape.eigenvectors,
             n_eigenvectors: shape.n_eigenvectors,
             mass: shape.mass,
+            faces: shape.faces,
             descriptors: &self.at_vertices,
             dim: self.features.dim,
         }
@@ -62,6 +70,53 @@ pub fn map(
     descriptor_zoomout(&from.1.map_shape(from.0), &to.1.map_shape(to.0), options)
 }
 
+/// As [`map`], grown from a given map `c_12 (k, k1)` in the place of nearest neighbours of descriptors.
+pub fn map_from(
+    from: (&DescriptionView<'_>, &Prepared),
+    to: (&DescriptionView<'_>, &Prepared),
+    start: (&[f32], usize),
+    options: &MapOptions,
+) -> FunctionalMap {
+    let (one, two) = (from.1.map_shape(from.0), to.1.map_shape(to.0));
+    descriptor_zoomout_from(&one, &two, start, options)
+}
+
+/// What maps are compared with: for each vertex of a shape the most alike vertex of a known one, and what to expect of it.
+pub fn map_by_descriptors(
+    from: (&DescriptionView<'_>, &Prepared),
+    to: (&DescriptionView<'_>, &Prepared),
+) -> (Vec<u32>, Confidence) {
+    nearest_descriptors(&from.1.map_shape(from.0), &to.1.map_shape(to.0))
+}
+
+/// How unlike a known shape is to another, by whatever vertices of it look most alike: mean squared descriptor difference
+/// between some vertices of the shape and the most alike of some of the known one. Predicts which maps carry labels well,
+/// without one. About `2 · 200 · 600 · dim` flops.
+pub fn unlikeness(known: &Prepared, shape: &Prepared) -> f64 {
+    const N_COMPARED: (usize, usize) = (600, 200);
+    let dim = shape.features.dim;
+    let some = |x: &[f32], count: usize| -> Vec<f32> {
+        let n = x.len() / dim;
+        let rows = (0..n).step_by((n / count).max(1));
+        rows.flat_map(|v| x[v * dim..(v + 1) * dim].iter().copied())
+            .collect()
+    };
+    let targets = some(&known.at_vertices, N_COMPARED.0);
+    let queries = some(&shape.at_vertices, N_COMPARED.1);
+    let nearest = nearest_rows(&queries, &targets, dim);
+    let rows = queries.chunks_exact(dim).zip(&nearest);
+    let sum: f64 = rows
+        .map(|(x, t)| {
+            let y = &targets[*t as usize * dim..(*t as usize + 1) * dim];
+            x.iter()
+                .zip(y)
+                .map(|(x, y)| f64::from((x - y) * (x - y)))
+                .sum::<f64>()
+        })
+        .sum();
+    sum / nearest.len().max(1) as f64
+}
+
 /// Labels that a known shape offers through a map to the shape being labelled.
 #[derive(Debug, Clone, Copy)]
 pub struct Vote<'a> {
@@ -71,8 +126,8 @@ pub struct Vote<'a> {
     pub probabilities: &'a [u8],
     /// For each vertex of the shape being labelled a vertex of the known one.
     pub p2p: &'a [u32],
-    /// Descriptor residual of the map.
-    pub residual: f64,
+    /// What to expect of the map at each vertex.
+    pub confidence: &'a Confidence,
     /// How much its labels are believed: 1 if they were carried, more if a person gave them.
     pub trust: f64,
 }
@@ -137,14 +192,7 @@ pub fn label(
         .classifier()
         .log_probabilities(&prepared.features);
     let (carried, weights) = carried(shape, votes, k);
-    let mut unary = Vec::with_capacity(log_model.len());
-    for (i, log) in log_model.iter().enumerate() {
-        let learnt = -log.max(FLOOR.ln());
-        unary.push(match carried.get(i) {
-            Some(p) => -VOTE_SHARE * p.max(FLOOR).ln() + (1.0 - VOTE_SHARE) * learnt,
-            None => learnt,
-        });
-    }
+    let unary = blended(&log_model, &carried, VOTE_SHARE, k);
     let classes = cut(&prepared.surface, &unary, k, STRENGTH, None);
     let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();
     for row in posterior.chunks_exact_mut(k) {
@@ -154,40 +202,66 @@ pub fn label(
     Labelling::new(classes, &posterior, weights, k)
 }
 
-/// Label probabilities of each face `(m, k)` by the votes, and the weight of each vote.
-pub(super) fn carried(
-    shape: &DescriptionView<'_>,
-    votes: &[Vote<'_>],
-    k: usize,
-) -> (Vec<f64>, Vec<f64>) {
-    let Some(least) = votes.iter().map(|v| v.residual).min_by(f64::total_cmp) else {
+/// What each class of each face costs `(m, k)`: the log-linear mean of the carried votes, of this share, and the label
+/// model's `log_model`; the latter alone where nothing was carried.
+pub(super) fn blended(log_model: &[f64], carried: &[f64], share: f64, k: usize) -> Vec<f64> {
+    let mut unary = Vec::with_capacity(log_model.len());
+    for (f, row) in log_model.chunks_exact(k).enumerate() {
+        let votes = carried.get(f * k..(f + 1) * k).unwrap_or_default();
+        let any = votes.iter().any(|p| *p > 0.0);
+        unary.extend(row.iter().enumerate().map(|(l, log)| {
+            let learnt = -log.max(FLOOR.ln());
+            match any {
+                true => -share * votes[l].max(FLOOR).ln() + (1.0 - share) * learnt,
+                false => learnt,
+            }
+        }));
+    }
+    unary
+}
+
+/// Label probabilities of each face `(m, k)` by the votes, 0 where nothing corresponds, and the share of each vote in all
+/// of them.
+pub fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f64>, Vec<f64>) {
+    if votes.is_empty() {
         return (Vec::new(), Vec::new());
+    }
+    let n = shape.vertices.len();
+    let weight = |vote: &Vote<'_>, v: usize| {
+        let certainty = vote.confidence.at(v)?;
+        let p = certainty.clamp(1.0 - MOST_CERTAIN, MOST_CERTAIN);
+        Some(vote.trust * (p / (1.0 - p)).powf(ODDS_POWER))
     };
-    let mut weights: Vec<f64> = votes
-        .iter()
-        .map(|v| v.trust * (-(v.residual - least) / (RESIDUAL_SCALE * least + 1e-9)).exp())
-        .collect();
-    let sum: f64 = weights.iter().sum();
-    weights.iter_mut().for_each(|w| *w /= sum);
-    let mut at_vertices = vec![0.0; shape.vertices.len() * k];
-    for (vote, weight) in votes.iter().zip(&weights) {
+    let mut total = vec![0.0; n];
+    for vote in votes {
+        for (v, sum) in total.iter_mut().enumerate() {
+            *sum += weight(vote, v).unwrap_or(0.0);
+        }
+    }
+    let mut at_vertices = vec![0.0; n * k];
+    let mut weights = vec![0.0; votes.len()];
+    for (vote, share) in votes.iter().zip(&mut weights) {
         let known = vertex_probabilities(vote, k);
         for (v, t) in vote.p2p.iter().enumerate() {
+            let Some(weight) = weight(vote, v) else {
+                continue;
+            };
+            let weight = weight / total[v];
+            *share += weight * f64::from(shape.mass[v]);
             let from = &known[*t as usize * k..(*t as usize + 1) * k];
             for (s, p) in at_vertices[v * k..(v + 1) * k].iter_mut().zip(from) {
                 *s += weight * p;
             }
         }
     }
+    let sum: f64 = weights.iter().sum();
+    weights.iter_mut().for_each(|w| *w /= sum.max(1e-300));
     let mut faces = Vec::with_capacity(shape.faces.len() * k);
     for face in shape.faces {
+        let matched = face.iter().filter(|v| total[**v as usize] > 0.0).count();
         for l in 0..k {
-            faces.push(
-                face.iter()
-                    .map(|v| at_vertices[*v as usize * k + l])
-                    .sum::<f64>()
-                    / 3.0,
-            );
+            let sum: f64 = face.iter().map(|v| at_vertices[*v as usize * k + l]).sum();
+            faces.push(sum / matched.max(1) as f64);
         }
     }
     (faces, weights)

@@ -3,13 +3,14 @@
 //! Reads only, and may run beside the daemon: the catalog is seen as of one moment, and a file that
 //! is missing counts only if the row that names it is still there afterwards.
 
+use super::agreement::KeptMaps;
 use super::catalog::KEPT_LABEL_VERSIONS;
 use super::catalog::schema::TABLES;
 use super::catalog::{self, Reader};
 use super::disk::{Disk, RealDisk};
 use super::error::CATALOG_FILE;
 use super::objects::{FOLDERS, map_description, read_original, relative};
-use super::rows::{ObjectKind, ObjectRow, ShapeId, ShapeRow};
+use super::rows::{CollectionId, ObjectKind, ObjectRow, ShapeId, ShapeRow};
 use super::{Digest, StoreError};
 use rusqlite::Connection;
 use rusqlite::types::FromSql;
@@ -23,7 +24,8 @@ pub struct Finding {
     pub place: String,
     /// What is wrong.
     pub message: String,
-    /// Whether data is lost or wrong; false for orphans that the next sweep removes.
+    /// Whether data is lost or wrong; false for orphans that the next sweep removes, and for maps that do not agree with
+    /// others.
     pub damage: bool,
 }
 
@@ -109,6 +111,14 @@ impl Findings {
                 damage: true,
             });
         }
+    }
+
+    fn note(&mut self, place: String, message: String) {
+        self.list.push(Finding {
+            place,
+            message,
+            damage: false,
+        });
     }
 
     fn error(&mut self, error: &StoreError) {
@@ -356,22 +366,61 @@ fn check_maps(
         let (Some(n1), Some(n2)) = (n_vertices(from), n_vertices(to)) else {
             continue;
         };
-        let place = format!("maps {from}, {to}");
-        if map.p2p_21.len() != n2 {
-            let found = map.p2p_21.len();
-            findings.damage(
-                &place,
-                format!("p2p_21 has {found} vertices, but the shape has {n2}"),
-            );
+        check_p2p(
+            findings,
+            &format!("maps {from}, {to}"),
+            &map.p2p_21,
+            (n1, n2),
+        );
+    }
+    for (id, _) in keys::<CollectionId, i64>(connection, "collections", "id, stream_id")? {
+        let Some(kept) = findings.keep(KeptMaps::read(reader, id)) else {
+            continue;
+        };
+        for ((from, to, _), standing) in kept.maps.iter().zip(kept.standings()) {
+            if standing.inconsistent {
+                let (from, to) = (kept.shapes[*from], kept.shapes[*to]);
+                let text = format!(
+                    "does not agree with the maps by way of other shapes: departure {:.2}, over {} triangles",
+                    standing.departure, standing.n_triangles
+                );
+                findings.note(format!("maps {from}, {to}"), text);
+            }
         }
-        if let Some(vertex) = map.p2p_21.iter().find(|&&vertex| vertex as usize >= n1) {
-            findings.damage(
-                &place,
-                format!("p2p_21 names vertex {vertex}, but there are {n1}"),
+    }
+    for (from, to, request) in reader.point_map_keys()? {
+        let kept = findings.keep(reader.point_maps(from, to, &request));
+        let mut n_vertices = |id| {
+            let shape = findings.keep(reader.shape(id)).flatten()?;
+            let described = arrays.get(&shape.description_digest);
+            described.map(|described| described.n_vertices)
+        };
+        let (Some(n1), Some(n2)) = (n_vertices(from), n_vertices(to)) else {
+            continue;
+        };
+        for map in kept.into_iter().flatten() {
+            check_p2p(
+                findings,
+                &format!("point_maps {from}, {to}"),
+                &map.p2p_21,
+                (n1, n2),
             );
         }
     }
     Ok(())
+}
+
+/// That a pointwise map is one from the `n2` vertices of one shape to the `n1` of another.
+fn check_p2p(findings: &mut Findings, place: &str, p2p_21: &[u32], (n1, n2): (usize, usize)) {
+    if p2p_21.len() != n2 {
+        let found = p2p_21.len();
+        let text = format!("p2p_21 has {found} vertices, but the shape has {n2}");
+        findings.damage(place, text);
+    }
+    if let Some(vertex) = p2p_21.iter().find(|&&vertex| vertex as usize >= n1) {
+        let text = format!("p2p_21 names vertex {vertex}, but there are {n1}");
+        findings.damage(place, text);
+    }
 }
 
 fn check_collections(

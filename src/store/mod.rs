@@ -17,6 +17,7 @@
 //! disk is an error that passes. Committed files never change. The catalog has one writer, and
 //! readers never wait for it. Orphans are swept when they are a day old, never at start.
 
+pub mod agreement;
 mod array_file;
 pub mod array_stream;
 pub mod catalog;
@@ -46,7 +47,7 @@ pub use objects::Objects;
 pub use rows::{
     CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
     LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
-    ObjectRow, RequestRow, ShapeId, ShapeRow,
+    ObjectRow, PointMapRow, RequestRow, ShapeId, ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

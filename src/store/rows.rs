@@ -257,8 +257,26 @@ pub struct MapRow {
     pub c_12: Vec<f32>,
     /// `p2p_21 (n2,)`: for each proxy vertex of `to` a proxy vertex of `from`.
     pub p2p_21: Vec<u32>,
+    /// What to expect of it at each proxy vertex of `to`, as the library writes it; empty in a map that was kept before that
+    /// was known.
+    pub confidence: Vec<u8>,
     /// How good it is, as the library writes it.
     pub quality_json: String,
+}
+
+/// A map between points that is kept.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointMapRow {
+    /// Rows and columns of `c_12`.
+    pub k: u32,
+    /// `c_12 (k, k)`, row-major.
+    pub c_12: Vec<f32>,
+    /// `p2p_21 (n2,)`: for each proxy vertex of the second shape a proxy vertex of the first.
+    pub p2p_21: Vec<u32>,
+    /// For each proxy vertex of the second shape 1 if something corresponds to it, else 0.
+    pub matched: Vec<u8>,
+    /// How good it is, as the library writes it.
+    pub detail_json: String,
 }
 
 /// Shapes that were accepted together.

@@ -34,6 +34,7 @@ fn help_tells_the_commands_and_the_exit_codes() {
         "labels",
         "export",
         "map",
+        "transfer",
         "nearest",
         "rm",
         "watch",
@@ -303,6 +304,26 @@ fn shapes_are_compared_named_and_removed() {
         shape
     );
     assert!(stdout(&home.coseg(&["map", "9", "10"]), 0).starts_with("9 to 10: c_12 ("));
+
+    let labels = stdout(&home.coseg(&["labels", "9"]), 0);
+    let (given, carried) = (home.path("given.txt"), home.path("carried.npy"));
+    std::fs::write(&given, &labels).unwrap();
+    let (given, carried) = (given.display().to_string(), carried.display().to_string());
+    let transfer = ["transfer", "9", "10", "--values", &given];
+    let text = stdout(&home.coseg(&transfer), 0);
+    let kinds: Vec<&str> = labels.split_whitespace().collect();
+    assert_eq!(text.lines().count(), 736);
+    assert!(text.lines().all(|l| l == "-1" || kinds.contains(&l)));
+    let told = json(
+        &home.coseg(&[&transfer[..], &["--json", "-o", &carried]].concat()),
+        0,
+    );
+    assert_eq!(told["rows"], 736);
+    let numpy = std::fs::read(&carried).unwrap();
+    assert_eq!(numpy.len(), 128 + 4 * 736);
+    std::fs::write(&given, "1 2\n3\n").unwrap();
+    let refused = stderr(&home.coseg(&transfer));
+    assert!(refused.contains("row 2 has 1 values"), "{refused}");
 
     let shown = json(&home.coseg(&["show", "--json"]), 0);
     let label = shown["labels"][0]["id"].to_string();

@@ -1,5 +1,6 @@
 //! Maps between points: against pyFM (pyfmaps 1.3.1) on its own pair of meshes, and through the library.
 
+mod kept;
 mod npz;
 
 use crate::pipeline::{COLLECTION, SMALL, library, stream};
@@ -298,7 +299,13 @@ fn the_library_maps_points_and_carries_values() {
         panic!("functions stay functions");
     };
     assert_eq!(values.len(), 2 * shapes[1].labels.len());
-    assert!(values.iter().all(|x| (x - 1.0).abs() < 1e-4));
+    assert!(values.iter().all(|x| x.is_nan() || (x - 1.0).abs() < 1e-4));
+    let known = values.iter().filter(|x| !x.is_nan()).count();
+    assert!(
+        known as f64 > 0.7 * values.len() as f64,
+        "{known} of {}",
+        values.len()
+    );
 
     let refused = |r: Result<(), LibraryError>| r.unwrap_err().to_string();
     let short = PolygonValues::Labels(vec![1, 2]);

@@ -171,6 +171,7 @@ fn add_shape(
                 p2p_21: (0..description.vertices.len())
                     .map(|i| (i % n1) as u32)
                     .collect(),
+                confidence: vec![seed as u8; description.vertices.len()],
                 quality_json: "{}".into(),
             })?;
         }

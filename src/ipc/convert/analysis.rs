@@ -52,6 +52,7 @@ fn quality(q: &Quality) -> wire::MapQuality {
         orthogonality: q.orthogonality,
         coverage: q.coverage,
         near_zero: q.near_zero,
+        matched: Some(q.matched),
         ..wire::MapQuality::default()
     }
 }
@@ -64,6 +65,20 @@ fn point_quality(map: &PointMap) -> wire::MapQuality {
         expected_error: Some(map.expected_error),
         ..quality(&map.quality)
     }
+}
+
+fn part_quality(q: &Quality) -> wire::MapQuality {
+    wire::MapQuality {
+        descriptor_return: Some(q.descriptor_return),
+        confidence: Some(q.confidence),
+        ..quality(q)
+    }
+}
+
+/// 1 where something corresponds, else 0.
+fn matched(matched: impl Iterator<Item = bool>, frames: &mut FrameWriter) -> wire::ArrayRef {
+    let flags: Vec<u32> = matched.map(u32::from).collect();
+    frames.u32_array(&flags, &[flags.len()])
 }
 
 /// What is asked of a map between points.
@@ -87,10 +102,12 @@ pub fn point_maps(maps: &[PointMap], frames: &mut FrameWriter) -> wire::GetFunct
         reply.c_12 = Some(frames.f32_array(&map.c_12, &[map.k, map.k]));
         reply.p2p_21 = Some(frames.u32_array(&map.p2p_21, &[map.p2p_21.len()]));
         reply.quality = Some(point_quality(map));
+        reply.matched = Some(matched(map.matched.iter().copied(), frames));
         if let Some(other) = maps.get(1) {
             reply.alternative_c_12 = Some(frames.f32_array(&other.c_12, &[other.k, other.k]));
             reply.alternative_p2p_21 = Some(frames.u32_array(&other.p2p_21, &[other.p2p_21.len()]));
             reply.alternative_quality = Some(point_quality(other));
+            reply.alternative_matched = Some(matched(other.matched.iter().copied(), frames));
             reply.alternative_cost = Some(other.cost / map.cost.max(1e-300));
         }
     }
@@ -143,10 +160,15 @@ pub fn transferred(
 
 /// A functional map.
 pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunctionalMapReply {
+    let n = map.p2p_21.len();
+    let at: Vec<Option<f64>> = (0..n).map(|v| map.confidence.at(v)).collect();
+    let confidence: Vec<f32> = at.iter().map(|c| c.unwrap_or(0.0) as f32).collect();
     wire::GetFunctionalMapReply {
         c_12: Some(frames.f32_array(&map.c_12, &[map.k2, map.k1])),
-        p2p_21: Some(frames.u32_array(&map.p2p_21, &[map.p2p_21.len()])),
-        quality: Some(quality(&map.quality)),
+        p2p_21: Some(frames.u32_array(&map.p2p_21, &[n])),
+        quality: Some(part_quality(&map.quality)),
+        matched: Some(matched(at.iter().map(Option::is_some), frames)),
+        confidence: Some(frames.f32_array(&confidence, &[n])),
         ..wire::GetFunctionalMapReply::default()
     }
 }
@@ -162,7 +184,7 @@ pub fn part_correspondence(matches: &[PartMatch], q: &Quality) -> wire::GetPartC
     });
     wire::GetPartCorrespondenceReply {
         matches: matches.collect(),
-        quality: Some(quality(q)),
+        quality: Some(part_quality(q)),
     }
 }
 

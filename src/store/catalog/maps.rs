@@ -1,11 +1,16 @@
-//! Functional maps that are kept. A map goes when either of its shapes goes.
+//! Functional maps that are kept, for parts and between points. A map goes when either of its shapes goes.
 
 use super::reader::{Fields, Reader, Tx};
-use super::schema::MAPS;
+use super::schema::{MAP_CONFIDENCE, MAPS, POINT_MAPS};
 use crate::store::StoreError;
-use crate::store::codec::{floats_from_blob, floats_to_blob, pack_u32, unpack_u32};
-use crate::store::rows::{MapRow, ShapeId};
+use crate::store::codec::{
+    floats_from_blob, floats_to_blob, pack_bytes, pack_u32, unpack_bytes, unpack_u32,
+};
+use crate::store::rows::{MapRow, PointMapRow, ShapeId};
 use rusqlite::params;
+
+/// Most maps between points that are kept; the oldest go first.
+pub(super) const MAX_POINT_MAPS: u64 = 500;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
@@ -17,6 +22,7 @@ fn map_row(fields: &Fields<'_>) -> Result<MapRow> {
         k2: fields.get("k2")?,
         c_12: fields.unpack("c_12", floats_from_blob)?,
         p2p_21: fields.unpack("p2p_21", unpack_u32)?,
+        confidence: Vec::new(),
         quality_json: fields.get("quality")?,
     };
     let expected = u64::from(row.k1) * u64::from(row.k2);
@@ -30,25 +36,95 @@ fn map_row(fields: &Fields<'_>) -> Result<MapRow> {
     Ok(row)
 }
 
+fn point_map_row(fields: &Fields<'_>) -> Result<PointMapRow> {
+    let row = PointMapRow {
+        k: fields.get("k")?,
+        c_12: fields.unpack("c_12", floats_from_blob)?,
+        p2p_21: fields.unpack("p2p_21", unpack_u32)?,
+        matched: fields.unpack("matched", unpack_bytes)?,
+        detail_json: fields.get("detail")?,
+    };
+    let (found, expected) = (row.c_12.len() as u64, u64::from(row.k).pow(2));
+    if found != expected {
+        let text = format!("{found} coefficients, but k · k = {expected}");
+        return Err(fields.damaged("c_12", text));
+    }
+    let (found, expected) = (row.matched.len(), row.p2p_21.len());
+    if found != expected {
+        let text = format!("{found} vertices, but the map has {expected}");
+        return Err(fields.damaged("matched", text));
+    }
+    Ok(row)
+}
+
 impl Reader<'_> {
     /// The map that carries functions on `from` to `to`.
     pub fn map(&self, from: ShapeId, to: ShapeId) -> Result<Option<MapRow>> {
-        self.first(
+        let found = self.first(
             &MAPS,
             "WHERE from_shape = ?1 AND to_shape = ?2",
             [from, to],
             map_row,
+        )?;
+        found.map(|row| self.with_confidence(row)).transpose()
+    }
+
+    fn with_confidence(&self, mut row: MapRow) -> Result<MapRow> {
+        let found = self.first(
+            &MAP_CONFIDENCE,
+            "WHERE from_shape = ?1 AND to_shape = ?2",
+            [row.from, row.to],
+            |fields| fields.unpack("of_vertex", unpack_bytes),
+        )?;
+        if let Some(confidence) = found {
+            let (found, expected) = (confidence.len(), row.p2p_21.len());
+            if found != expected {
+                return Err(StoreError::DamagedRow {
+                    table: MAP_CONFIDENCE.name,
+                    key: format!("{}, {}", row.from, row.to),
+                    message: format!("{found} vertices, but the map has {expected}"),
+                });
+            }
+            row.confidence = confidence;
+        }
+        Ok(row)
+    }
+
+    /// The maps between points that were found for a request, as the library writes it, best first; none if none is kept.
+    pub fn point_maps(
+        &self,
+        from: ShapeId,
+        to: ShapeId,
+        request: &str,
+    ) -> Result<Vec<PointMapRow>> {
+        self.all(
+            &POINT_MAPS,
+            "WHERE from_shape = ?1 AND to_shape = ?2 AND request = ?3 ORDER BY rank",
+            params![from, to, request],
+            point_map_row,
         )
+    }
+
+    /// Which maps between points there are: from, to, request. Their rows are not read.
+    pub fn point_map_keys(&self) -> Result<Vec<(ShapeId, ShapeId, String)>> {
+        let mut statement = self.connection().prepare_cached(
+            "SELECT DISTINCT from_shape, to_shape, request FROM point_maps
+             ORDER BY from_shape, to_shape, request",
+        )?;
+        let key = |row: &rusqlite::Row<'_>| -> rusqlite::Result<(ShapeId, ShapeId, String)> {
+            Ok((row.get(0)?, row.get(1)?, row.get(2)?))
+        };
+        let keys = statement.query_map([], key)?;
+        Ok(keys.collect::<rusqlite::Result<_>>()?)
     }
 
     /// All maps that carry functions to a shape, in order of their sources' ids.
     pub fn maps_into(&self, to: ShapeId) -> Result<Vec<MapRow>> {
-        self.all(
-            &MAPS,
-            "WHERE to_shape = ?1 ORDER BY from_shape",
-            [to],
-            map_row,
-        )
+        let tail = "WHERE to_shape = ?1 ORDER BY from_shape";
+        let rows = self.all(&MAPS, tail, [to], map_row)?;
+        rows.into_iter()
+            .map(|row| self.with_confidence(row))
+            .collect()
     }
 
     /// The shapes that a shape's functions are carried to, in order of their ids.
@@ -93,7 +169,54 @@ impl Tx<'_> {
             p2p_21,
             map.quality_json
         ];
-        self.insert(&MAPS, key, row)?;
+        self.insert(&MAPS, key.clone(), row)?;
+        if !map.confidence.is_empty() {
+            let confidence = pack_bytes(&map.confidence);
+            let row = params![map.from, map.to, confidence];
+            self.insert(&MAP_CONFIDENCE, key, row)?;
+        }
+        Ok(())
+    }
+
+    /// Keeps the maps between points that were found for a request, best first, in the place of those that were. The
+    /// oldest of more than [`MAX_POINT_MAPS`] are forgotten.
+    pub fn put_point_maps(
+        &self,
+        from: ShapeId,
+        to: ShapeId,
+        request: &str,
+        maps: &[PointMapRow],
+    ) -> Result<()> {
+        self.delete_point_maps(from, to, request)?;
+        for (rank, map) in maps.iter().enumerate() {
+            let (c_12, p2p_21) = (floats_to_blob(&map.c_12), pack_u32(&map.p2p_21));
+            let (rank, matched) = (rank as u64, pack_bytes(&map.matched));
+            let row = params![
+                from,
+                to,
+                request,
+                rank,
+                map.k,
+                c_12,
+                p2p_21,
+                matched,
+                map.detail_json
+            ];
+            self.insert(&POINT_MAPS, format!("{from}, {to}, {request}, {rank}"), row)?;
+        }
+        self.execute(
+            "DELETE FROM point_maps WHERE rowid <= (SELECT max(rowid) FROM point_maps) - ?1",
+            [MAX_POINT_MAPS],
+        )?;
+        Ok(())
+    }
+
+    /// Forgets the maps between points that were found for a request, if they are there.
+    pub fn delete_point_maps(&self, from: ShapeId, to: ShapeId, request: &str) -> Result<()> {
+        self.execute(
+            "DELETE FROM point_maps WHERE from_shape = ?1 AND to_shape = ?2 AND request = ?3",
+            params![from, to, request],
+        )?;
         Ok(())
     }
 

@@ -11,10 +11,13 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are refused.
-pub const CATALOG_FORMAT: u32 = 2;
+pub const CATALOG_FORMAT: u32 = 3;
 
 /// The format before corrections: its tables are there unchanged, [`SINCE_FORMAT_2`] are missing.
 const WITHOUT_CORRECTIONS: u32 = 1;
+
+/// The format before maps said what to expect of them vertex by vertex: [`SINCE_FORMAT_3`] are missing.
+const WITHOUT_CONFIDENCE: u32 = 2;
 
 /// `cseg`, where SQLite files say whose they are.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -172,6 +175,20 @@ tables! {
      k2 INTEGER NOT NULL, c_12 BLOB NOT NULL, p2p_21 BLOB NOT NULL, quality TEXT NOT NULL,
      sum INTEGER, PRIMARY KEY (from_shape, to_shape)"
 
+    MAP_CONFIDENCE "map_confidence" key 2 ["from_shape", "to_shape", "of_vertex"]
+    "from_shape INTEGER NOT NULL, to_shape INTEGER NOT NULL, of_vertex BLOB NOT NULL, sum INTEGER,
+     PRIMARY KEY (from_shape, to_shape),
+     FOREIGN KEY (from_shape, to_shape) REFERENCES maps ON DELETE CASCADE"
+
+    POINT_MAPS "point_maps" key 4 [
+        "from_shape", "to_shape", "request", "rank", "k", "c_12", "p2p_21", "matched", "detail",
+    ]
+    "from_shape INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE,
+     to_shape INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, request TEXT NOT NULL,
+     rank INTEGER NOT NULL, k INTEGER NOT NULL, c_12 BLOB NOT NULL, p2p_21 BLOB NOT NULL,
+     matched BLOB NOT NULL, detail TEXT NOT NULL, sum INTEGER,
+     PRIMARY KEY (from_shape, to_shape, request, rank)"
+
     JOBS "jobs" key 1 ["id", "collection", "created"]
     "id INTEGER PRIMARY KEY AUTOINCREMENT, collection TEXT NOT NULL, created INTEGER NOT NULL,
      sum INTEGER"
@@ -197,6 +214,14 @@ const SINCE_FORMAT_2: [&Table; 3] = [&PINS, &CORRECTIONS, &LABELS_BEFORE];
 const INDEXES_SINCE_FORMAT_2: &str = "
     CREATE INDEX corrections_by_collection ON corrections (collection_id, id);
     CREATE INDEX labels_before_by_shape ON labels_before (shape_id, version);
+";
+
+/// Tables that format 3 added.
+const SINCE_FORMAT_3: [&Table; 2] = [&MAP_CONFIDENCE, &POINT_MAPS];
+
+/// Indexes of those.
+const INDEXES_SINCE_FORMAT_3: &str = "
+    CREATE INDEX point_maps_by_to ON point_maps (to_shape);
 ";
 
 const INDEXES: &str = "
@@ -252,6 +277,7 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     }
     tx.execute_batch(INDEXES)?;
     tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
+    tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
     tx.execute(
         "INSERT INTO meta (key, value) VALUES ('library_id', lower(hex(randomblob(16)))), (?1, ?2)",
         params!["format", CATALOG_FORMAT.to_string()],
@@ -262,21 +288,27 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     Ok(())
 }
 
-/// Brings a catalog of format 1 to format 2, in one transaction; others are left alone.
+/// Brings a catalog of an older format to this one, in one transaction; others are left alone.
 fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     let pragma = |name: &str| -> rusqlite::Result<u32> {
         connection.pragma_query_value(None, name, |row| row.get(0))
     };
-    let is_old = pragma("application_id")? == APPLICATION_ID
-        && pragma("user_version")? == WITHOUT_CORRECTIONS;
-    if !is_old {
+    let found = pragma("user_version")?;
+    let is_old = matches!(found, WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE);
+    if pragma("application_id")? != APPLICATION_ID || !is_old {
         return Ok(());
     }
     let tx = connection.transaction()?;
-    for table in SINCE_FORMAT_2 {
+    if found == WITHOUT_CORRECTIONS {
+        for table in SINCE_FORMAT_2 {
+            tx.execute_batch(&table.create())?;
+        }
+        tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
+    }
+    for table in SINCE_FORMAT_3 {
         tx.execute_batch(&table.create())?;
     }
-    tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
+    tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
     tx.execute(
         "UPDATE meta SET value = ?1 WHERE key = 'format'",
         [CATALOG_FORMAT.to_string()],

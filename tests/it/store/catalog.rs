@@ -361,6 +361,7 @@ fn rows_need_what_they_refer_to() -> Result<()> {
         k2: 1,
         c_12: vec![1.0],
         p2p_21: vec![],
+        confidence: vec![],
         quality_json: "{}".into(),
     };
     let put = store.catalog().write(|tx| tx.put_map(&map));

@@ -85,7 +85,7 @@ fn many_readers_beside_a_writer_see_whole_commits() -> Result<()> {
 }
 
 #[test]
-fn a_catalog_of_format_1_is_brought_to_format_2() -> Result<()> {
+fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
     let (_dir, store) = opened();
     let library = store.dir().to_path_buf();
     drop(store);
@@ -96,15 +96,20 @@ fn a_catalog_of_format_1_is_brought_to_format_2() -> Result<()> {
             .pragma_query_value(None, "user_version", |row| row.get(0))
             .expect("a number")
     };
-    rusqlite::Connection::open(&catalog)
-        .expect("opens")
-        .execute_batch(
-            "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;
-             PRAGMA user_version = 1",
-        )
-        .expect("runs");
+    let old = |sql: &str| {
+        rusqlite::Connection::open(&catalog)
+            .expect("opens")
+            .execute_batch(sql)
+            .expect("runs");
+    };
+    old("DROP TABLE point_maps; DROP TABLE map_confidence; PRAGMA user_version = 2");
+    drop(Store::open(&library)?);
+    assert_eq!(format(), 3);
+    old("DROP TABLE point_maps; DROP TABLE map_confidence;
+         DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;
+         PRAGMA user_version = 1");
     let store = Store::open(&library)?;
-    assert_eq!(format(), 2);
+    assert_eq!(format(), 3);
     let new = coseg::store::NewCollection {
         name: "old".into(),
         ..Default::default()
@@ -128,20 +133,20 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 3");
+    change("PRAGMA user_version = 4");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 3,
-                supported: 2,
+                found: 4,
+                supported: 3,
                 ..
             }
         ),
         "{newer}"
     );
-    change("PRAGMA user_version = 2; PRAGMA application_id = 7");
+    change("PRAGMA user_version = 3; PRAGMA application_id = 7");
     assert!(Store::open(&library).err().expect("refused").is_damage());
     let other = dir.path().join("other");
     std::fs::create_dir(&other).expect("created");

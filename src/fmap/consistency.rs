@@ -1,0 +1,237 @@
+//! Maps between many shapes become a statement about each of them: whether it agrees with the others.
+//!
+//! Around a triangle of shapes the map by way of the third is compared with the direct one (Zach, Klopschitz and Pollefeys
+//! 2010, *Disambiguating Visual Relations Using Loop Constraints*; Huang and Guibas 2013, *Consistent Shape Maps via
+//! Semidefinite Programming*). A wrong map spoils all its triangles, a right one only those that it shares with a wrong
+//! one, so the median over its triangles tells them apart.
+
+use super::basis::product;
+use super::samples::columns;
+use nalgebra::DMatrix;
+
+/// Triangles by which a map can be judged at least.
+const MIN_TRIANGLES: usize = 2;
+/// Median departures beyond that of all maps by this many deviations are no chance.
+const DEVIATIONS: f64 = 3.0;
+/// The median deviation of normally distributed values times this is their standard deviation.
+const OF_NORMAL: f64 = 1.4826;
+/// Departures spread at least this much, however alike those of a small collection are.
+const LEAST_SPREAD: f64 = 0.03;
+
+/// A functional map between two shapes of a collection, by their numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Link<'a> {
+    /// Functions are carried from this shape
+    pub from: usize,
+    /// to this one.
+    pub to: usize,
+    /// `(k_to, k_from)`, row-major.
+    pub c_12: &'a [f32],
+    /// How much it is believed.
+    pub weight: f64,
+}
+
+impl Link<'_> {
+    /// The map as a matrix, given the sizes of all shapes.
+    pub(super) fn matrix(&self, sizes: &[usize]) -> DMatrix<f64> {
+        let (rows, columns) = (sizes[self.to], sizes[self.from]);
+        let n = self.c_12.len();
+        assert_eq!(
+            n,
+            rows * columns,
+            "a map of {n} entries, but {rows} by {columns}"
+        );
+        DMatrix::from_fn(rows, columns, |i, j| f64::from(self.c_12[i * columns + j]))
+    }
+}
+
+/// How a map agrees with the others.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Standing {
+    /// Triangles of maps that it is part of.
+    pub n_triangles: usize,
+    /// Median over these of how far the map by way of the third shape is from the direct one: `‖C_bc C_ab − C_ac‖` over
+    /// the mean of both norms. 0 is not at all; maps that have nothing to do with each other have about 1.4. 0 also where
+    /// there is no triangle.
+    pub departure: f64,
+    /// Whether that is more than can be expected of maps of this collection.
+    pub inconsistent: bool,
+}
+
+/// Departures of all triangles `a → b → c` with `a → c`: the numbers of the three maps, and the departure.
+/// `sizes` has for each shape the rows of maps to it. O(triangles k³).
+///
+/// # Panics
+/// If a map names a shape that does not exist, or has not as many entries as its shapes say.
+pub fn triangles(sizes: &[usize], links: &[Link<'_>]) -> Vec<([usize; 3], f64)> {
+    let mut out_of: Vec<Vec<usize>> = vec![Vec::new(); sizes.len()];
+    for (l, link) in links.iter().enumerate() {
+        out_of[link.from].push(l);
+    }
+    let mut found = Vec::new();
+    for (ab, first) in links.iter().enumerate() {
+        for &bc in &out_of[first.to] {
+            let second = &links[bc];
+            for &ac in &out_of[first.from] {
+                if links[ac].to != second.to {
+                    continue;
+                }
+                let (ka, kb, kc) = (sizes[first.from], sizes[first.to], sizes[second.to]);
+                let round = product(second.c_12, first.c_12, kc, kb, ka);
+                let direct = links[ac].c_12;
+                let norm = |x: &mut dyn Iterator<Item = f32>| {
+                    x.map(|x| f64::from(x * x)).sum::<f64>().sqrt()
+                };
+                let apart = norm(&mut round.iter().zip(direct).map(|(x, y)| x - y));
+                let size = norm(&mut round.iter().copied()) + norm(&mut direct.iter().copied());
+                found.push(([ab, bc, ac], apart / (0.5 * size).max(1e-300)));
+            }
+        }
+    }
+    found
+}
+
+/// How each map agrees with the others.
+///
+/// # Panics
+/// As [`triangles`].
+pub fn standings(sizes: &[usize], links: &[Link<'_>]) -> Vec<Standing> {
+    let mut departures: Vec<Vec<f64>> = vec![Vec::new(); links.len()];
+    for (three, departure) in triangles(sizes, links) {
+        three.iter().for_each(|l| departures[*l].push(departure));
+    }
+    let mut standings: Vec<Standing> = departures
+        .iter_mut()
+        .map(|of| Standing {
+            n_triangles: of.len(),
+            departure: median(of),
+            inconsistent: false,
+        })
+        .collect();
+    let judged = |s: &&Standing| s.n_triangles >= MIN_TRIANGLES;
+    let mut values: Vec<f64> = standings
+        .iter()
+        .filter(judged)
+        .map(|s| s.departure)
+        .collect();
+    let centre = median(&mut values);
+    let mut apart: Vec<f64> = values.iter().map(|x| (x - centre).abs()).collect();
+    let spread = (OF_NORMAL * median(&mut apart)).max(LEAST_SPREAD);
+    for s in &mut standings {
+        let enough = s.n_triangles >= MIN_TRIANGLES;
+        s.inconsistent = enough && s.departure > centre + DEVIATIONS * spread;
+    }
+    standings
+}
+
+/// The leading `(rows, columns)` of a map with `stride` columns.
+pub fn leading(c_12: &[f32], stride: usize, rows: usize, columns_wanted: usize) -> Vec<f32> {
+    columns(&c_12[..rows * stride], stride, columns_wanted)
+}
+
+/// The median; 0 of nothing.
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    match values.len() {
+        0 => 0.0,
+        n if n % 2 == 1 => values[n / 2],
+        n => 0.5 * (values[n / 2 - 1] + values[n / 2]),
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::super::convert::functional;
+    use super::super::test_shapes::{Curve, cycle};
+    use super::{Link, standings};
+    use rand::seq::SliceRandom;
+    use rand::{Rng, SeedableRng};
+
+    /// Eigenfunctions of each shape.
+    pub(in super::super) const K: usize = 11;
+    const N: usize = 120;
+
+    /// From, to, and the map.
+    pub(in super::super) type Numbered = (usize, usize, Vec<f32>);
+
+    /// Closed curves that are turned against each other, with maps from each to the next few that send every vertex to one
+    /// near the right one.
+    pub(in super::super) fn turned(n: usize) -> (Vec<Curve>, Vec<Numbered>) {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(7);
+        let turns: Vec<usize> = (0..n).map(|_| rng.random_range(0..N)).collect();
+        let shapes: Vec<Curve> = turns.iter().map(|t| cycle(N, *t)).collect();
+        let mut maps = Vec::new();
+        for j in 1..n {
+            for i in j.saturating_sub(4)..j {
+                let mut right = |v: usize| {
+                    let near = rng.random_range(0..5);
+                    (v + turns[j] + 2 * N - turns[i] + near - 2) % N
+                };
+                let p2p: Vec<u32> = (0..N).map(|v| right(v) as u32).collect();
+                let c = functional(&shapes[i].basis(), &shapes[j].basis(), &p2p, K, K);
+                maps.push((i, j, c));
+            }
+        }
+        (shapes, maps)
+    }
+
+    /// Makes maps wrong: those of every eighth are of vertices in any order, or of a curve turned by a third.
+    pub(in super::super) fn spoil(shapes: &[Curve], maps: &mut [Numbered]) -> Vec<usize> {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(8);
+        let wrong: Vec<usize> = (5..maps.len() - 5).step_by(8).collect();
+        for (n, at) in wrong.iter().enumerate() {
+            let (i, j, _) = maps[*at];
+            let mut p2p: Vec<u32> = (0..N as u32).collect();
+            match n % 2 {
+                0 => p2p.shuffle(&mut rng),
+                _ => {
+                    let c = &maps[*at].2;
+                    let right = super::super::convert::pointwise(
+                        &shapes[i].basis(),
+                        &shapes[j].basis(),
+                        c,
+                        K,
+                    );
+                    p2p = right
+                        .iter()
+                        .map(|v| (v + N as u32 / 3) % N as u32)
+                        .collect();
+                }
+            }
+            maps[*at].2 = functional(&shapes[i].basis(), &shapes[j].basis(), &p2p, K, K);
+        }
+        wrong
+    }
+
+    pub(in super::super) fn links(maps: &[Numbered]) -> Vec<Link<'_>> {
+        maps.iter()
+            .map(|(from, to, c_12)| Link {
+                from: *from,
+                to: *to,
+                c_12,
+                weight: 1.0,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn exactly_the_wrong_maps_do_not_agree() {
+        let (shapes, mut maps) = turned(14);
+        let sizes = vec![K; shapes.len()];
+        let before = standings(&sizes, &links(&maps));
+        assert!(before.iter().all(|s| !s.inconsistent));
+        let wrong = spoil(&shapes, &mut maps);
+        assert!(wrong.len() >= 5);
+        let after = standings(&sizes, &links(&maps));
+        let found: Vec<usize> = (0..maps.len()).filter(|m| after[*m].inconsistent).collect();
+        assert_eq!(found, wrong);
+    }
+
+    #[test]
+    fn two_shapes_say_nothing() {
+        let (shapes, maps) = turned(2);
+        let found = standings(&vec![K; shapes.len()], &links(&maps));
+        assert_eq!((found.len(), found[0].n_triangles), (1, 0));
+        assert!(!found[0].inconsistent);
+    }
+}
