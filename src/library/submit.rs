@@ -226,6 +226,7 @@ impl Library {
             stages_ms,
             digest,
             params_json,
+            stored: None,
         })
     }
 
