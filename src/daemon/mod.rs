@@ -2,7 +2,7 @@
 //!
 //! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts what
 //! arrives into reads (side by side), changes (one after the other, in order of arrival) and waits;
-//! [`work`] describes and places accepted shapes; [`publish`] sends what the event log gained.
+//! [`work`] describes and [`placing`] places accepted shapes; [`publish`] sends what the event log gained.
 //! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
 
 mod access;
@@ -10,6 +10,7 @@ mod fair;
 mod http;
 mod memory;
 mod metrics;
+mod placing;
 mod progress;
 mod publish;
 mod quota;
@@ -109,6 +110,8 @@ struct Counters {
 
 /// What all tasks of the daemon share.
 struct Daemon {
+    // Before the library: its workers end first.
+    pool: worker::Pool,
     library: Library,
     config: RwLock<Arc<Config>>,
     endpoint: Endpoint,
@@ -133,7 +136,8 @@ struct Daemon {
     outbox: Arc<Outbox>,
     notices: mpsc::UnboundedSender<Notice>,
     work: Work,
-    pool: worker::Pool,
+    /// A permit for each shape that may be placed at a time.
+    placing: Arc<Semaphore>,
     drain: watch::Sender<bool>,
     /// A client asked for the drain.
     asked_to_drain: std::sync::mpsc::Sender<service::Control>,
@@ -217,8 +221,12 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let (notices, notices_out) = mpsc::unbounded_channel();
     let (asked_to_drain, control) = std::sync::mpsc::channel();
     let n_workers = config.n_workers();
+    library.store().share_lock().map_err(|e| opened(e.into()))?;
+    let pool = worker::Pool::new(&directory, n_workers).map_err(StartError::Worker)?;
     let daemon = Arc::new(Daemon {
+        pool,
         library,
+        placing: Arc::new(Semaphore::new(n_workers)),
         endpoint: bound.endpoint.clone(),
         events: bound.events.clone(),
         instance: instance(),
@@ -237,7 +245,6 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         outbox: Arc::clone(&bound.outbox),
         notices,
         work: Work::new(),
-        pool: worker::Pool::new(n_workers).map_err(StartError::Worker)?,
         drain: watch::Sender::new(false),
         asked_to_drain,
         config: RwLock::new(Arc::new(config)),
@@ -441,6 +448,7 @@ impl Running {
         };
         // Inside, for the timer needs the runtime.
         let ended = runtime.block_on(async { tokio::time::timeout(limit, last_work).await });
+        self.daemon.pool.close();
         if ended.is_err() {
             tracing::warn!("the drain took longer than {} s", limit.as_secs());
         }

@@ -231,7 +231,7 @@ fn events_since(
     Ok(wire::EventsSinceReply { events, more })
 }
 
-fn hello(daemon: &Daemon) -> wire::HelloReply {
+pub(crate) fn hello(daemon: &Daemon) -> wire::HelloReply {
     let limits = daemon.config().limits.clone();
     wire::HelloReply {
         version: env!("CARGO_PKG_VERSION").to_owned(),

@@ -89,8 +89,12 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             Body::WaitIdle(request) => {
                 tokio::spawn(in_hand.respond(daemon, async move |d| wait_idle(&d, &request).await));
             }
-            Body::Hello(_)
-            | Body::Stats(_)
+            // Needs nothing that may be busy: whoever asks wants to know whether the daemon lives.
+            Body::Hello(_) => {
+                let hello = reply::Result::Hello(reads::hello(&daemon));
+                in_hand.finish(&daemon, Ok((hello, Vec::new())));
+            }
+            Body::Stats(_)
             | Body::ListCollections(_)
             | Body::DescribeCollection(_)
             | Body::GetJob(_)
@@ -150,13 +154,22 @@ async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, tu
     let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the change is made: who waits for the placing holds no frames.
     let memory = in_hand.incoming.memory.take();
-    let done = blocking(&daemon, move |d| {
-        let _memory = memory;
-        let (body, frames) = (body, frames);
-        writes::change(d, &body, &frames, key.as_ref())
+    let changing = Arc::clone(&daemon);
+    let mut done = tokio::spawn(async move {
+        let done = blocking(&changing, move |d| {
+            let _memory = memory;
+            let (body, frames) = (body, frames);
+            writes::change(d, &body, &frames, key.as_ref())
+        });
+        let done = done.await;
+        drop(pass);
+        done
     });
-    let done = done.await;
-    drop(pass);
+    let Some(done) = in_hand.by_deadline(&mut done).await else {
+        // It goes on and keeps its turn; the same request id, asked again, tells what came of it.
+        return in_hand.late(&daemon, None);
+    };
+    let done = done.unwrap_or_else(|e| Err(e.to_string()));
     in_hand.incoming.ticket.free_bytes();
     match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
         Ok(writes::Done::Now(result)) => {

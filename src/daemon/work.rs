@@ -1,20 +1,18 @@
 //! Accepted shapes are described side by side and placed one after the other.
 //!
 //! One scheduler hands waiting shapes to describing threads, as many as there are workers and memory
-//! for, collections in turn. One lane for each collection places them strictly in order of acceptance,
-//! however the describing threads overtake each other. A lane with nothing to place relabels stale shapes.
+//! for, collections in turn. One lane for each collection ([`placing`]) places them strictly in order of acceptance,
+//! however the describing threads overtake each other.
 
 use crate::config::Limits;
 use crate::daemon::memory::Reservation;
 use crate::daemon::progress::{Progress, Waiting};
-use crate::daemon::publish::Notice;
-use crate::daemon::worker::Ended;
-use crate::daemon::{Daemon, blocking, panic_text};
+use crate::daemon::worker::{Ended, panicked};
+use crate::daemon::{Daemon, panic_text, placing};
 use crate::ipc::convert;
 use crate::library::isolate::DescribeJob;
-use crate::library::{Described, Failure, ItemState, Job, JobItem, LibraryError};
+use crate::library::{Described, Failure, Job, JobItem, LibraryError};
 use crate::pipeline::Description;
-use crate::store::StoreError;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,11 +21,11 @@ use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
 /// What describing came to.
-type Outcome = Result<Described, Failure>;
+pub(super) type Outcome = Result<Described, Failure>;
 
 /// A shape on its way to its lane.
 #[allow(clippy::large_enum_variant)] // one at a time for each worker, never in a collection
-enum Prepared {
+pub(super) enum Prepared {
     /// It was described, or failed to be.
     Described(Box<Outcome>),
     /// When its turn to be described came, no description was needed: the same bytes were there under its
@@ -45,17 +43,13 @@ pub(crate) enum Step {
 
 /// A shape whose description is under way.
 pub(crate) struct Ready {
-    item: JobItem,
+    pub(super) item: JobItem,
     /// Dropped without a value if the daemon drains: the shape stays queued in the catalog.
-    prepared: oneshot::Receiver<(Prepared, Reservation)>,
+    pub(super) prepared: oneshot::Receiver<(Prepared, Reservation)>,
 }
 
 /// How often the work on a shape may end its worker before it has failed.
-const MAX_ATTEMPTS: u32 = 3;
-/// Delay before a failed write is tried again, doubled each time.
-const FIRST_RETRY: Duration = Duration::from_secs(1);
-const LAST_RETRY: Duration = Duration::from_secs(30);
-
+pub(super) const MAX_ATTEMPTS: u32 = 3;
 /// The work in hand.
 pub(crate) struct Work {
     progress: Mutex<Progress<Step>>,
@@ -86,7 +80,7 @@ impl Work {
         self.changes.subscribe()
     }
 
-    fn changed(&self) {
+    pub(super) fn changed(&self) {
         self.changes.send_modify(|n| *n += 1);
     }
 }
@@ -142,7 +136,7 @@ impl Daemon {
         }
         let (sender, receiver) = mpsc::unbounded_channel();
         progress.add_lane(collection, sender);
-        let lane = place_in_order(Arc::clone(self), collection.to_owned(), receiver);
+        let lane = placing::place_in_order(Arc::clone(self), collection.to_owned(), receiver);
         let mut lanes = self
             .work
             .lanes
@@ -242,7 +236,7 @@ async fn hand_out(daemon: &Arc<Daemon>) {
     }
 }
 
-fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
+pub(super) fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
     match daemon.library.needs_description(item) {
         Ok(false) => Prepared::NotNeeded,
         Ok(true) => Prepared::Described(Box::new(describe(daemon, item))),
@@ -280,16 +274,8 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
                     out_of_memory,
                 }) => (text, out_of_memory),
             };
-            let noted = daemon.library.note_attempt(item, &text);
-            let attempts = noted.map_err(|e| convert::library_failure(&e))?;
-            daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
-            tracing::warn!(
-                collection = item.collection,
-                shape = item.name,
-                attempts,
-                text,
-                "a worker ended while it described a shape"
-            );
+            let attempts =
+                note_death(daemon, item, &text).map_err(|e| convert::library_failure(&e))?;
             if attempts >= MAX_ATTEMPTS {
                 return Err(died(&text, out_of_memory, attempts));
             }
@@ -305,16 +291,28 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
         Ok(Ok(described)) => Ok(described),
         Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
         Ok(Err(failure)) if failure.code == "CANCELLED" && begin.elapsed() >= limit => {
-            let (found, limit) = (begin.elapsed().as_secs_f64(), limit.as_secs());
-            let message = format!("describing it took {found:.0} s, the limit is {limit} s");
-            Err(failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message))
+            Err(too_long("describing", begin.elapsed(), limit))
         }
         Ok(Err(failure)) => Err(failure),
         Err(panic) => Err(panicked(&panic_text(panic.as_ref()))),
     }
 }
 
-fn died(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
+/// Counts, durably, that the work on a shape has ended its worker; how often now, or 0 if the shape is over.
+pub(super) fn note_death(daemon: &Daemon, item: &JobItem, text: &str) -> Result<u32, LibraryError> {
+    let attempts = daemon.library.note_attempt(item, text)?;
+    daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+    tracing::warn!(
+        collection = item.collection,
+        shape = item.name,
+        attempts,
+        text,
+        "a worker ended while it worked on a shape"
+    );
+    Ok(attempts)
+}
+
+pub(super) fn died(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
     let reason = if out_of_memory {
         "SHAPE_MEMORY"
     } else {
@@ -343,7 +341,7 @@ fn bytes_of(d: &Description) -> u64 {
     (4 * (floats + integers) + 12 * triples + 8 * d.eigenvalues.len()) as u64
 }
 
-fn failed(code: &str, reason: &str, message: String) -> Failure {
+pub(super) fn failed(code: &str, reason: &str, message: String) -> Failure {
     Failure {
         code: code.to_owned(),
         reason: reason.to_owned(),
@@ -352,199 +350,13 @@ fn failed(code: &str, reason: &str, message: String) -> Failure {
     }
 }
 
-fn cancelled() -> Failure {
+pub(super) fn cancelled() -> Failure {
     let message = "the job was cancelled before this shape was placed".to_owned();
     failed("CANCELLED", "CANCELLED", message)
 }
 
-fn panicked(text: &str) -> Failure {
-    failed(
-        "INTERNAL",
-        "PANIC",
-        format!("the work on this shape panicked: {text}"),
-    )
-}
-
-/// A collection's lane.
-async fn place_in_order(
-    daemon: Arc<Daemon>,
-    collection: String,
-    mut steps: mpsc::UnboundedReceiver<Step>,
-) {
-    let mut relabel = true;
-    loop {
-        let step = match steps.try_recv() {
-            Ok(step) => step,
-            Err(mpsc::error::TryRecvError::Empty) if relabel => {
-                relabel = relabel_next(&daemon, &collection).await;
-                continue;
-            }
-            Err(_) => match steps.recv().await {
-                Some(step) => step,
-                None => return,
-            },
-        };
-        let mut ready = match step {
-            Step::Place(ready) => ready,
-            Step::Relabel => {
-                relabel = true;
-                continue;
-            }
-        };
-        let prepared = loop {
-            match ready.prepared.try_recv() {
-                Ok(prepared) => break Ok(prepared),
-                Err(oneshot::error::TryRecvError::Empty) if relabel => {
-                    relabel = relabel_next(&daemon, &collection).await;
-                }
-                Err(_) => break (&mut ready.prepared).await,
-            }
-        };
-        // Draining: this shape and all after it stay queued.
-        let Ok((prepared, _memory)) = prepared else {
-            return;
-        };
-        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else {
-            return;
-        };
-        if !place(&daemon, &ready.item, outcome).await {
-            return;
-        }
-        relabel = true;
-    }
-}
-
-/// What is to be placed, now that all before it are. `None`: the daemon drains.
-async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
-    if let Prepared::Described(outcome) = prepared {
-        return Some(*outcome);
-    }
-    let subject = item.clone();
-    // A shape before it may have removed the reason why no description was needed.
-    let settled = blocking(daemon, move |d| match prepare(d, &subject) {
-        Prepared::Described(outcome) => *outcome,
-        // The library sees by itself why, before it looks at this.
-        Prepared::NotNeeded => Err(failed(
-            "INTERNAL",
-            "GONE",
-            "it was not described".to_owned(),
-        )),
-    });
-    let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
-    (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
-}
-
-/// Places one shape and commits. False: the daemon drains and the shape stays queued.
-async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bool {
-    if daemon.work.progress().is_cancelled(item.job) {
-        outcome = Err(cancelled());
-    }
-    daemon.work.progress().set_stage(item, "place");
-    daemon.work.changed();
-    let mut delay = FIRST_RETRY;
-    let mut draining = daemon.drain.subscribe();
-    loop {
-        let (again, subject) = (outcome.clone(), item.clone());
-        let placed = blocking(daemon, move |d| d.library.place_item(&subject, again)).await;
-        let failure = match placed {
-            Ok(Ok(state)) => {
-                report(daemon, item, &state);
-                break;
-            }
-            // Nothing was written: there may be space again, or a restart, and the shape is still queued.
-            Ok(Err(LibraryError::Store(
-                e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
-            ))) => {
-                daemon.metrics.fault("place");
-                tracing::error!(
-                    collection = item.collection, shape = item.name, error = %e,
-                    "a shape cannot be stored; trying again in {} s", delay.as_secs()
-                );
-                tokio::select! {
-                    () = tokio::time::sleep(delay) => {}
-                    _ = draining.wait_for(|&d| d) => return false,
-                }
-                delay = (delay * 2).min(LAST_RETRY);
-                continue;
-            }
-            Ok(Err(e)) => convert::library_failure(&e),
-            Err(panic) => panicked(&panic),
-        };
-        if outcome.is_err() {
-            // Not even the failure can be recorded: the collection or the job is gone.
-            tracing::warn!(
-                collection = item.collection,
-                shape = item.name,
-                job = item.job,
-                message = failure.message,
-                "a shape was dropped"
-            );
-            break;
-        }
-        outcome = Err(failure);
-    }
-    daemon.work.progress().finish(item);
-    daemon.work.changed();
-    daemon.notice(Notice::Changed(item.collection.clone()));
-    true
-}
-
-fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
-    let (collection, shape) = (&item.collection, &item.name);
-    match state {
-        ItemState::Done(placed) => {
-            daemon.metrics.placed(placed);
-            tracing::info!(
-                collection, shape, outcome = ?placed.outcome, version = placed.version,
-                ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
-            );
-        }
-        ItemState::Failed(f) => {
-            daemon.metrics.finished("failed");
-            daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
-            tracing::warn!(
-                collection,
-                shape,
-                code = f.code,
-                reason = f.reason,
-                message = f.message,
-                "failed"
-            );
-        }
-        ItemState::Cancelled => {
-            daemon.metrics.finished("cancelled");
-            tracing::info!(collection, shape, "cancelled");
-        }
-        ItemState::Queued | ItemState::Running(_) => {
-            tracing::error!(collection, shape, "was placed but is not over");
-        }
-    }
-}
-
-/// Relabels one stale shape of the collection. False: none was stale, or not now.
-async fn relabel_next(daemon: &Arc<Daemon>, collection: &str) -> bool {
-    if daemon.is_draining() {
-        return false;
-    }
-    let name = collection.to_owned();
-    let relabelled = blocking(daemon, move |d| d.library.relabel_next(Some(&name))).await;
-    let again = match relabelled {
-        Ok(Ok(again)) => again,
-        Ok(Err(LibraryError::NotFound { .. })) => false,
-        Ok(Err(e)) => {
-            daemon.metrics.fault("relabel");
-            tracing::error!(collection, error = %e, "a stale shape cannot be relabelled");
-            false
-        }
-        Err(panic) => {
-            tracing::error!(collection, panic, "relabelling panicked");
-            false
-        }
-    };
-    if again {
-        daemon.metrics.relabelled.inc();
-        daemon.notice(Notice::Changed(collection.to_owned()));
-    }
-    daemon.work.changed();
-    again
+pub(super) fn too_long(doing: &str, took: Duration, limit: Duration) -> Failure {
+    let (found, limit) = (took.as_secs_f64(), limit.as_secs());
+    let message = format!("{doing} it took {found:.0} s, the limit is {limit} s");
+    failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message)
 }

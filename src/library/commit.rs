@@ -4,7 +4,7 @@ use super::lane::{KnownShape, Lane};
 use super::place::Plan;
 use super::relabel::{NewLabels, Relabelled};
 use super::rows::{label_colour, quality_to_json, to_json};
-use super::{EventKind, Library, Placed, Result, Source};
+use super::{EventKind, Library, LibraryError, Placed, Result, Source};
 use crate::fmap::FunctionalMap;
 use crate::pipeline::LabelChange;
 use crate::store::{
@@ -38,6 +38,7 @@ impl Library {
         let accepted = commit.plan.reclustered.is_some_and(|r| r.2);
         let blob = commit.plan.learnt.encode();
         let (id, row) = self.store.catalog().write(|tx| -> Result<_> {
+            still_queued(tx, commit.accepted)?;
             if let Some(old) = commit.replaced {
                 tx.delete_shape(old.id)?;
                 event(
@@ -130,6 +131,18 @@ impl Library {
         })?;
         Ok(())
     }
+}
+
+/// Refuses what was cancelled while it was placed, so that it is either cancelled or placed.
+fn still_queued(tx: &Tx<'_>, accepted: &JobItemRow) -> Result<()> {
+    let items = tx.job_items(accepted.job)?;
+    let item = items.iter().find(|i| i.index == accepted.index);
+    if item.is_some_and(|i| i.status == ItemStatus::Queued) {
+        return Ok(());
+    }
+    let message = format!("item {} of job {} is over", accepted.index, accepted.job);
+    let reason = "CANCELLED";
+    Err(LibraryError::FailedPrecondition { reason, message })
 }
 
 /// Appends an event to a collection's log and returns its sequence number.

@@ -29,6 +29,7 @@
 //! ```
 
 mod agreement;
+mod apart;
 mod carry;
 mod collections;
 mod commit;
@@ -52,6 +53,7 @@ mod teach;
 mod types;
 
 pub use agreement::Disagreement;
+pub use apart::{state_from_json, state_to_json};
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
@@ -70,7 +72,7 @@ pub use types::{
 use crate::pipeline::Description;
 use crate::store::check::Finding;
 use crate::store::snapshot::Snapshot;
-use crate::store::{CollectionId, CollectionRow, Digest, Store};
+use crate::store::{CollectionId, CollectionRow, Digest, ObjectRow, Store};
 use lane::Lane;
 use std::collections::HashMap;
 use std::path::Path;
@@ -102,6 +104,8 @@ pub struct Described {
     pub stages_ms: Vec<(String, f64)>,
     digest: Digest,
     params_json: String,
+    /// Its file, if it is stored already.
+    stored: Option<ObjectRow>,
 }
 
 impl Library {
@@ -110,13 +114,17 @@ impl Library {
     /// # Errors
     /// The folder is held by another process, cannot be written, or is of a newer format.
     pub fn open(dir: &Path) -> Result<Self> {
-        Ok(Self {
-            store: Store::open(dir)?,
+        Ok(Self::over(Store::open(dir)?))
+    }
+
+    fn over(store: Store) -> Self {
+        Self {
+            store,
             lanes: Mutex::default(),
             running: Mutex::default(),
             max_maps: AtomicU64::new(0),
             max_relabelled: AtomicU64::new(0),
-        })
+        }
     }
 
     /// Verifies everything on disk against the catalog, of a library that no process holds.
@@ -141,8 +149,8 @@ impl Library {
         &self.store
     }
 
-    /// Runs `work` on the lane of a collection, alone. After an error the lane is read anew, so that it cannot
-    /// differ from the catalog.
+    /// Runs `work` on the lane of a collection, alone. After an error, and after another process has changed the
+    /// collection, the lane is read anew, so that it cannot differ from the catalog.
     fn with_lane<T>(
         &self,
         row: CollectionRow,
@@ -156,9 +164,19 @@ impl Library {
                 .or_default(),
         );
         let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
+        // As it is now that nobody else is at it: the caller's may be older.
+        let name = row.name;
+        let row = self
+            .store
+            .catalog()
+            .read(|r| r.collection_by_id(row.id).map_err(LibraryError::from))?;
+        let row = row.ok_or(LibraryError::NotFound {
+            what: "collection",
+            name,
+        })?;
         let mut lane = match slot.take() {
-            Some(lane) => lane,
-            None => self.store.catalog().read(|r| Lane::load(r, row))?,
+            Some(lane) if lane.row == row => lane,
+            _ => self.store.catalog().read(|r| Lane::load(r, row))?,
         };
         let done = work(&mut lane)?;
         *slot = Some(lane);

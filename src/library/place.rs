@@ -67,11 +67,15 @@ impl Library {
         let description = described.description;
         let view = description.view();
         let digest = described.digest;
-        let object =
-            self.store
-                .objects()
-                .put_description(digest, &description, &described.params_json)?;
-        lap("store");
+        let object = match described.stored {
+            Some(stored) => stored,
+            None => {
+                let objects = self.store.objects();
+                let put = objects.put_description(digest, &description, &described.params_json)?;
+                lap("store");
+                put
+            }
+        };
         let was_pinned = match replaced {
             Some(old) => self.forget(lane, old)?,
             None => false,

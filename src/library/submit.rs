@@ -232,6 +232,7 @@ impl Library {
             stages_ms,
             digest,
             params_json,
+            stored: None,
         })
     }
 

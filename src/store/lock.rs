@@ -2,6 +2,8 @@
 
 use super::StoreError;
 use rustix::fs::{FlockOperation, flock};
+use rustix::io::{FdFlags, fcntl_setfd};
+use rustix::process::{Pid, test_kill_process};
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
@@ -13,6 +15,8 @@ pub const LOCK_FILE: &str = "lock";
 /// A process that was killed may have left a child between fork and exec, which shares its open files
 /// for a moment.
 const PATIENCE: Duration = Duration::from_millis(300);
+/// The same, where the process that the lock file names is gone: then those that it let hold the library too are ending.
+const PATIENCE_AFTER_DEATH: Duration = Duration::from_secs(10);
 
 /// An exclusive lock on a library folder. The kernel releases it when the process ends, however it
 /// ends, so a lock left behind by a crash does not exist.
@@ -30,11 +34,11 @@ impl Drop for LibraryLock {
 }
 
 impl LibraryLock {
-    /// Takes the lock, or says within a third of a second that it is held. The lock file names the holder's process id for people; it
-    /// is never removed, since removing it would let two processes lock two different files.
+    /// Takes the lock, or says within a third of a second that a running process holds it. The lock file names the
+    /// holder's process id; it is never removed, since removing it would let two processes lock two different files.
     pub fn acquire(dir: &Path) -> Result<Self, StoreError> {
         let path = dir.join(LOCK_FILE);
-        let mut file = File::options()
+        let file = File::options()
             .read(true)
             .write(true)
             .create(true)
@@ -45,7 +49,7 @@ impl LibraryLock {
         loop {
             match flock(&file, FlockOperation::NonBlockingLockExclusive) {
                 Ok(()) => break,
-                Err(rustix::io::Errno::WOULDBLOCK) if begin.elapsed() < PATIENCE => {
+                Err(rustix::io::Errno::WOULDBLOCK) if begin.elapsed() < patience(&path) => {
                     std::thread::sleep(Duration::from_millis(5));
                 }
                 Err(rustix::io::Errno::WOULDBLOCK) => {
@@ -56,9 +60,26 @@ impl LibraryLock {
                 Err(errno) => return Err(StoreError::io(&path, errno.into())),
             }
         }
-        file.set_len(0)
-            .and_then(|()| writeln!(file, "{}", std::process::id()))
+        let mut lock = Self { file };
+        lock.file
+            .set_len(0)
+            .and_then(|()| writeln!(lock.file, "{}", std::process::id()))
             .map_err(|e| StoreError::io(&path, e))?;
-        Ok(Self { file })
+        Ok(lock)
+    }
+
+    /// Lets processes that are started from now on hold the lock too, for as long as they live.
+    pub(super) fn share(&self) -> std::io::Result<()> {
+        Ok(fcntl_setfd(&self.file, FdFlags::empty())?)
+    }
+}
+
+/// How long to try.
+fn patience(lock: &Path) -> Duration {
+    let holder = std::fs::read_to_string(lock).ok();
+    let pid = holder.and_then(|text| Pid::from_raw(text.trim().parse().ok()?));
+    match pid.map(test_kill_process) {
+        Some(Err(rustix::io::Errno::SRCH)) => PATIENCE_AFTER_DEATH,
+        _ => PATIENCE,
     }
 }

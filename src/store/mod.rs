@@ -62,8 +62,8 @@ pub struct Store {
     catalog: Catalog,
     health: Health,
     dir: PathBuf,
-    // Last, so that it is released after the catalog is closed.
-    _lock: LibraryLock,
+    // Last, so that it is released after the catalog is closed. None: another process holds it.
+    lock: Option<LibraryLock>,
 }
 
 impl Store {
@@ -82,8 +82,33 @@ impl Store {
             catalog,
             health,
             dir: dir.to_path_buf(),
-            _lock: lock,
+            lock: Some(lock),
         })
+    }
+
+    /// Opens the library in `dir`, which another process holds, to change what that process lets this one change. It must
+    /// be there, in the current format.
+    pub fn open_beside(dir: &Path) -> Result<Self, StoreError> {
+        let health = Health::default();
+        let catalog = Catalog::open_beside(&catalog::path_in(dir), health.clone())?;
+        let disk: Arc<dyn Disk> = Arc::new(RealDisk);
+        let objects = Objects::open(disk, dir, health.clone())?;
+        Ok(Self {
+            objects,
+            catalog,
+            health,
+            dir: dir.to_path_buf(),
+            lock: None,
+        })
+    }
+
+    /// Lets the processes that this one starts from now on hold the library too, until they end: nobody else opens it
+    /// while one of them may still write.
+    pub fn share_lock(&self) -> Result<(), StoreError> {
+        match &self.lock {
+            Some(lock) => lock.share().map_err(|e| StoreError::io(&self.dir, e)),
+            None => Ok(()),
+        }
     }
 
     /// The object files.

@@ -7,6 +7,8 @@ mod life;
 mod overload;
 mod repeats;
 mod security;
+mod stages;
+mod stopped;
 
 use crate::harness::{DEADLINE, Home, add, add_request, refusal, skittle, wait_idle};
 use coseg::call;
@@ -332,7 +334,14 @@ fn events_arrive_in_order_and_are_those_of_the_log() {
     wait_idle(client, "c");
     let log = events_since(client, "c");
     let mut received = Vec::new();
+    let begin = std::time::Instant::now();
     while received.len() + 1 < log.len() {
+        assert!(
+            begin.elapsed() < DEADLINE,
+            "{} of {}",
+            received.len() + 1,
+            log.len()
+        );
         let (topic, event) = next();
         if topic == b"\0" {
             continue;

@@ -13,10 +13,10 @@ use std::fmt::Write as _;
 use std::panic::catch_unwind;
 use std::time::{Duration, Instant};
 
-struct Hostile {
-    name: String,
-    format: Format,
-    bytes: Vec<u8>,
+pub(crate) struct Hostile {
+    pub(crate) name: String,
+    pub(crate) format: Format,
+    pub(crate) bytes: Vec<u8>,
 }
 
 /// A tetrahedron as OBJ and as OFF, to be spoilt.
@@ -24,7 +24,7 @@ const OBJ: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4
 const OFF: &str = "OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
 
 /// At least 150 of them, each with a name.
-fn corpus() -> Vec<Hostile> {
+pub(crate) fn corpus() -> Vec<Hostile> {
     let all = RefCell::new(Vec::new());
     let put = |format: Format, name: &str, bytes: Vec<u8>| {
         all.borrow_mut().push(Hostile {

@@ -17,7 +17,7 @@ use coseg::store::rows::{
 use coseg::store::{Digest, Store, StoreError};
 
 /// A description of `n` vertices on a strip, its values a function of `seed`.
-fn description(n: usize, seed: u32) -> Description {
+pub(crate) fn description(n: usize, seed: u32) -> Description {
     let value = |i: usize| ((i as u32).wrapping_mul(2_654_435_761) ^ seed) as f32 / 4e9 - 0.5;
     let values = |count: usize| (0..count).map(value).collect::<Vec<_>>();
     let m = n - 2;

@@ -78,6 +78,20 @@ fn health_and_metrics_are_told() {
             "docs/metrics.md does not have {name}"
         );
     }
+    // What the documents name is exposed, in families that may have no member yet.
+    let is_name = |c: char| c.is_alphanumeric() || c == '_';
+    let operations = include_str!("../../docs/operations.md");
+    for name in [document, operations]
+        .iter()
+        .flat_map(|text| text.split(|c| !is_name(c)))
+        .filter(|word| word.starts_with("coseg_"))
+    {
+        let family = ["_total", "_info", "_bucket", "_count", "_sum"]
+            .iter()
+            .find_map(|end| name.strip_suffix(end));
+        let family = format!("# TYPE {} ", family.unwrap_or(name));
+        assert!(text.contains(&family), "{name} is not exposed");
+    }
     let dashboard = include_str!("../../config/grafana/dashboard.json");
     let dashboard: serde_json::Value = serde_json::from_str(dashboard).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();

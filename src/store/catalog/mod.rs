@@ -26,8 +26,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// Other processes hold the file's lock only for moments (a backup, `sqlite3`).
-const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+/// Other processes hold the file's lock only for moments (a worker that commits, a backup, `sqlite3`), but a disk can be
+/// slow.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Connections that are kept for the next reader; a burst opens more and closes them again.
 const KEPT_READERS: usize = 4;
@@ -67,40 +68,33 @@ impl Catalog {
                 message,
             });
         }
-        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE
-            | OpenFlags::SQLITE_OPEN_CREATE
-            | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-        let mut connection = Connection::open_with_flags(path, flags)?;
-        schema::register_row_sum(&connection)?;
-        connection.busy_timeout(BUSY_TIMEOUT)?;
-        connection.pragma_update(None, "foreign_keys", true)?;
+        let mut connection = open_writer(path, OpenFlags::SQLITE_OPEN_CREATE)?;
         schema::prepare(&mut connection, &path.display().to_string())?;
-        let mode: String =
-            connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
-        if mode != "wal" {
-            return Err(StoreError::Damaged {
-                path: path.display().to_string(),
-                message: format!("its file system allows journal mode {mode:?} only, not \"wal\""),
-            });
-        }
-        connection.pragma_update(None, "synchronous", "FULL")?;
-        // With neither spills nor automatic checkpoints, all syncs happen in COMMIT and in
-        // `checkpoint`, where their failures are seen.
-        connection.pragma_update(None, "cache_spill", false)?;
-        connection.pragma_update(None, "wal_autocheckpoint", 0)?;
-        connection.set_prepared_statement_cache_capacity(128);
+        prepare_writer(&connection, path)?;
         refuse_writes_if_damaged(&connection, path, &health)?;
+        Ok(Self::over(connection, path, health))
+    }
+
+    /// Opens the catalog at `path`, which another process has opened and goes on to use. Each waits for the other's
+    /// writes, a few seconds at most.
+    pub fn open_beside(path: &Path, health: Health) -> Result<Self, StoreError> {
+        let connection = open_writer(path, OpenFlags::empty())?;
+        schema::check_format(&connection, &path.display().to_string())?;
+        prepare_writer(&connection, path)?;
+        Ok(Self::over(connection, path, health))
+    }
+
+    fn over(connection: Connection, path: &Path, health: Health) -> Self {
         let writer = Writer {
             connection,
             checkpoint_at: CHECKPOINT_BYTES,
         };
-        let path = path.to_path_buf();
-        Ok(Self {
-            path,
+        Self {
+            path: path.to_path_buf(),
             health,
             writer: Mutex::new(writer),
             readers: Mutex::new(Vec::new()),
-        })
+        }
     }
 
     /// Runs `change` in a transaction, which is durable when this returns `Ok`, and leaves no trace
@@ -183,6 +177,35 @@ impl Catalog {
     fn readers(&self) -> MutexGuard<'_, Vec<Connection>> {
         self.readers.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// A connection that may write.
+fn open_writer(path: &Path, more: OpenFlags) -> Result<Connection, StoreError> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX | more;
+    let connection = Connection::open_with_flags(path, flags)?;
+    schema::register_row_sum(&connection)?;
+    connection.busy_timeout(BUSY_TIMEOUT)?;
+    connection.pragma_update(None, "foreign_keys", true)?;
+    Ok(connection)
+}
+
+/// How a connection commits.
+fn prepare_writer(connection: &Connection, path: &Path) -> Result<(), StoreError> {
+    let mode: String =
+        connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
+    if mode != "wal" {
+        return Err(StoreError::Damaged {
+            path: path.display().to_string(),
+            message: format!("its file system allows journal mode {mode:?} only, not \"wal\""),
+        });
+    }
+    connection.pragma_update(None, "synchronous", "FULL")?;
+    // With neither spills nor automatic checkpoints, all syncs happen in COMMIT and in
+    // `checkpoint`, where their failures are seen.
+    connection.pragma_update(None, "cache_spill", false)?;
+    connection.pragma_update(None, "wal_autocheckpoint", 0)?;
+    connection.set_prepared_statement_cache_capacity(128);
+    Ok(())
 }
 
 /// Looks for structural damage, which a lookup may not notice: a row that a broken index hides seems

@@ -93,6 +93,114 @@ fn ten_times_too_much_from_64_clients_is_refused_politely() {
     assert!(stats.resident_bytes < stats.memory_limit_bytes);
 }
 
+/// Clients that come back after the delay they were told, for as long as there is too much.
+#[test]
+fn what_is_accepted_under_overload_is_accepted_quickly() {
+    let seconds = crate::harness::number("COSEG_TEST_SECONDS", 8);
+    let home = Home::new();
+    let env = [("COSEG__LIMITS__MAX_QUEUED_SHAPES", "16")];
+    let daemon = home.start_with(&[], &env);
+    create(&mut daemon.client(), "c");
+    let mesh = skittle(0);
+    let request = |name: &str| {
+        let (body, frames) = add_request("c", &[(name, &mesh)], wire::AddMode::Job);
+        let Body::AddShapes(mut request) = body else {
+            unreachable!()
+        };
+        request.create = None;
+        (Body::AddShapes(request), frames)
+    };
+    // One client that adds one after the other, which leaves room in the queue.
+    let mut alone = Vec::new();
+    let one = &mut daemon.client();
+    for n in 0..20 {
+        let (body, frames) = request(&format!("alone {n}"));
+        let begin = Instant::now();
+        one.call(body, frames).unwrap();
+        alone.push(begin.elapsed());
+        wait_idle(one, "c");
+    }
+    let until = Instant::now() + Duration::from_secs(seconds);
+    let taken = Mutex::new((Vec::new(), Vec::new()));
+    std::thread::scope(|scope| {
+        for client in 0..64 {
+            let (taken, request) = (&taken, &request);
+            let mut connection = daemon.client();
+            scope.spawn(move || {
+                let mut n = 0;
+                while Instant::now() < until {
+                    let (body, frames) = request(&format!("{client}-{n}"));
+                    let begin = Instant::now();
+                    match connection.call(body, frames) {
+                        Ok(_) => {
+                            taken.lock().unwrap().0.push(begin.elapsed());
+                            n += 1;
+                        }
+                        Err(ClientError::Refused(e)) => {
+                            taken.lock().unwrap().1.push(begin.elapsed());
+                            assert_eq!(e.code(), ErrorCode::ResourceExhausted, "{e:?}");
+                            let pause = Duration::from_millis(e.retry_after_ms);
+                            std::thread::sleep(pause.min(until - Instant::now().min(until)));
+                        }
+                        Err(e) => panic!("{e}"),
+                    }
+                }
+            });
+        }
+    });
+    let (accepted, refused) = taken.into_inner().unwrap();
+    let (n, n_refused) = (accepted.len(), refused.len());
+    let mut median = accepted.clone();
+    median.sort();
+    let (alone, loaded) = (p99(alone), p99(accepted));
+    println!(
+        "{seconds} s: {n} accepted, {n_refused} refused; accepted in {:?} (median), {loaded:?} (p99), \
+         {alone:?} (p99) unloaded; refused in {:?} (p99)",
+        median[n / 2],
+        p99(refused)
+    );
+    assert!(n_refused > 64, "{n_refused}");
+    // Sixteen may have been accepted at once in the beginning, one after the other.
+    let allowed = (2 * alone).max(Duration::from_secs(2));
+    assert!(loaded <= allowed, "{loaded:?}, unloaded {alone:?}");
+    let stats = call!(one, Stats(wire::StatsRequest {})).unwrap();
+    assert!(stats.resident_bytes < stats.memory_limit_bytes);
+}
+
+/// With the time that clients allow by default, while the workers have their hands full.
+#[test]
+fn large_files_are_taken_in_while_the_machine_is_busy() {
+    let home = Home::new();
+    let daemon = home.start();
+    create(&mut daemon.client(), "c");
+    let mesh = skittle(0);
+    let names: Vec<String> = (0..24).map(|i| format!("s{i}")).collect();
+    let shapes: Vec<_> = names.iter().map(|n| (n.as_str(), mesh.as_str())).collect();
+    let (body, frames) = add_request("d", &shapes, wire::AddMode::Job);
+    daemon.client().call(body, frames).unwrap();
+    let large = format!(
+        "{mesh}{}",
+        "# a line that says nothing\n".repeat(36 << 20 >> 5)
+    );
+    assert!(large.len() > 28 << 20);
+    let timeout = coseg::ipc::client::DEFAULT_TIMEOUT;
+    let mut client = Client::connect(&home.endpoint(), timeout).unwrap();
+    for name in ["x", "y", "z"] {
+        let begin = Instant::now();
+        let (body, frames) = add_request("c", &[(name, &large)], wire::AddMode::Job);
+        let Body::AddShapes(request) = body else {
+            unreachable!()
+        };
+        let request = wire::AddShapesRequest {
+            create: None,
+            ..request
+        };
+        client.call(Body::AddShapes(request), frames).unwrap();
+        let n = large.len() >> 20;
+        println!("{n} MB were taken in within {:?}", begin.elapsed());
+    }
+}
+
 #[test]
 fn what_the_queue_can_never_hold_is_refused_for_good() {
     let home = Home::new();

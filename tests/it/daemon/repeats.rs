@@ -1,7 +1,7 @@
 //! Requests that are sent again and again, and a subscriber that loses its connection, its daemon and its time.
 
 use super::{events_since, wait_idle};
-use crate::harness::{Daemon, Home, add_request, seed, skittle};
+use crate::harness::{Daemon, Home, add_request, number, seed, skittle};
 use coseg::call;
 use coseg::ipc::client::Client;
 use coseg::ipc::wire::{self, event::Kind, reply, request::Body};
@@ -11,10 +11,17 @@ use rustix::process::Signal;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
+/// `COSEG_TEST_ROUNDS` makes it longer.
 #[test]
 fn each_request_has_one_effect_however_often_it_is_sent() {
-    let seed = seed();
-    println!("COSEG_TEST_SEED={seed}");
+    let (n_rounds, seed) = (number("COSEG_TEST_ROUNDS", 1), seed());
+    println!("{n_rounds} rounds, COSEG_TEST_SEED={seed}");
+    for round in 0..n_rounds {
+        send_each_again_and_again(seed + round);
+    }
+}
+
+fn send_each_again_and_again(seed: u64) {
     let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
     let home = Home::new();
     let mut daemon = home.start();

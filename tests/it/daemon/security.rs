@@ -216,15 +216,105 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
     keys.apply(&subscriber).unwrap();
     subscriber.set_linger(0).unwrap();
     subscriber.set_subscribe(&vec![b'x'; 64 << 10]).unwrap();
+    // With it, everything: the heartbeats would be heard if the connection stayed.
+    subscriber.set_subscribe(b"").unwrap();
     subscriber
         .connect(&format!("tcp://127.0.0.1:{port}"))
         .unwrap();
-    subscriber.set_rcvtimeo(1_000).unwrap();
-    assert!(subscriber.recv_msg(0).is_err());
+    subscriber.set_rcvtimeo(3_000).unwrap();
+    assert!(subscriber.recv_msg(0).is_err(), "the topic was taken");
     reader
         .call(Body::Hello(wire::HelloRequest {}), Vec::new())
         .unwrap();
     let stats = call!(reader, Stats(wire::StatsRequest {})).unwrap();
     assert_eq!(stats.pid, daemon.child.id());
     assert!(stats.resident_bytes < 512 << 20, "{}", stats.resident_bytes);
+}
+
+/// A connection that speaks the protocol of ZeroMQ by hand: its own sockets fall over a topic of ten megabytes
+/// themselves, on the client's side, for they go into its tree of topics by recursion.
+fn by_hand(address: &str, socket_type: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(SERVED)).unwrap();
+    let mut greeting = vec![0xFF, 0, 0, 0, 0, 0, 0, 0, 0, 0x7F, 3, 0];
+    greeting.extend(b"NULL");
+    greeting.resize(64, 0);
+    stream.write_all(&greeting).unwrap();
+    let mut ready = b"\x05READY\x0bSocket-Type".to_vec();
+    ready.extend((socket_type.len() as u32).to_be_bytes());
+    ready.extend(socket_type.as_bytes());
+    let frame = [&[4, ready.len() as u8], ready.as_slice()].concat();
+    stream.write_all(&frame).unwrap();
+    // Its greeting, and the beginning of its own READY.
+    let mut answer = [0; 66];
+    std::io::Read::read_exact(&mut stream, &mut answer).unwrap();
+    stream
+}
+
+/// Whether the daemon ends the connection over a frame that is announced with this length.
+fn is_ended_over(mut stream: TcpStream, length: u64) -> bool {
+    let mut header = vec![2];
+    header.extend(length.to_be_bytes());
+    header.push(1);
+    stream.write_all(&header).unwrap();
+    let piece = vec![b'x'; 1 << 16];
+    let mut left = length - 1;
+    while left > 0 {
+        let n = left.min(1 << 16);
+        if stream.write_all(&piece[..n as usize]).is_err() {
+            return true;
+        }
+        left -= n;
+    }
+    // What was still sent, a heartbeat perhaps; then the end.
+    stream
+        .set_read_timeout(Some(Duration::from_secs(5)))
+        .unwrap();
+    let mut rest = [0; 1 << 12];
+    loop {
+        match std::io::Read::read(&mut stream, &mut rest) {
+            Ok(0) => return true,
+            Ok(_) => {}
+            Err(e) => return e.kind() == std::io::ErrorKind::ConnectionReset,
+        }
+    }
+}
+
+#[test]
+fn topics_and_frames_beyond_the_limits_end_their_connection_only() {
+    let home = Home::new();
+    let mut daemon = home.start_with(&["--endpoint", "tcp://127.0.0.1:*"], &[]);
+    let line = daemon.await_line("serving");
+    let bound = line.split("endpoint=").nth(1).unwrap();
+    let endpoint = bound.split(' ').next().unwrap().to_owned();
+    let mut good = Client::connect(&endpoint, SERVED).unwrap();
+    let events = good.hello().unwrap().event_endpoint.clone();
+    let address = |uri: &str| uri.strip_prefix("tcp://").unwrap().to_owned();
+    let heard = good.subscribe(None).unwrap();
+    heard.set_rcvtimeo(30_000).unwrap();
+    let resident = |client: &mut Client| {
+        let stats = call!(client, Stats(wire::StatsRequest {})).unwrap();
+        stats.resident_bytes
+    };
+    let before = resident(&mut good);
+    for (uri, kind, length) in [
+        (&events, "SUB", 4_097),
+        (&events, "SUB", 10 << 20),
+        (&events, "SUB", 1 << 62),
+        (&endpoint, "DEALER", 129 << 20),
+        (&endpoint, "DEALER", u64::MAX),
+    ] {
+        let stream = by_hand(&address(uri), kind);
+        assert!(is_ended_over(stream, length), "{kind}: {length} bytes");
+    }
+    let grown = resident(&mut good).saturating_sub(before);
+    println!(
+        "{} MB more resident after frames of up to 2^64 bytes",
+        grown >> 20
+    );
+    assert!(grown < 64 << 20, "{grown}");
+    while heard.recv_msg(zmq::DONTWAIT).is_ok() {}
+    heard.recv_msg(0).unwrap();
+    good.call(Body::Hello(wire::HelloRequest {}), Vec::new())
+        .unwrap();
 }

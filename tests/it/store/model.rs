@@ -26,13 +26,23 @@ struct Model {
     sequences: BTreeMap<String, u64>,
 }
 
-fn compare(store: &Store, model: &Model, context: &str) {
+fn compare(store: &Store, model: &Model, whole: bool, context: &str) {
     let read = store.catalog().read(|r| {
         for (name, sequence) in &model.sequences {
             assert_eq!(r.sequence(name)?, *sequence, "{context}: log of {name}");
-            let events = r.events_since(name, 0, usize::MAX)?;
+            // The newest, and at the end all: a log only grows.
+            let from = if whole {
+                0
+            } else {
+                sequence.saturating_sub(200)
+            };
+            let events = r.events_since(name, from, usize::MAX)?;
             let numbers: Vec<u64> = events.iter().map(|e| e.sequence).collect();
-            assert_eq!(numbers, (1..=*sequence).collect::<Vec<_>>(), "{context}");
+            assert_eq!(
+                numbers,
+                (from + 1..=*sequence).collect::<Vec<_>>(),
+                "{context}"
+            );
         }
         let names: Vec<String> = r.collections()?.into_iter().map(|c| c.name).collect();
         assert_eq!(
@@ -189,7 +199,7 @@ fn random_operations_agree_with_a_model_across_restarts() {
             90..94 => {
                 store.sweep_orphans(Duration::ZERO).expect("swept");
             }
-            94..97 => compare(&store, &model, &context),
+            94..97 => compare(&store, &model, false, &context),
             _ => {
                 n_restarts += 1;
                 drop(store);
@@ -197,7 +207,7 @@ fn random_operations_agree_with_a_model_across_restarts() {
             }
         }
     }
-    compare(&store, &model, "at the end");
+    compare(&store, &model, true, "at the end");
     drop(store);
     assert_eq!(
         check(dir.path())

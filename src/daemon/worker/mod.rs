@@ -1,34 +1,42 @@
-//! Shapes are described in processes of their own, so that none can take the daemon down.
+//! Shapes are described and placed in processes of their own, so that none can take the daemon down.
 //!
-//! A worker is the same program again (`coseg worker`): it reads a shape from stdin, describes it, and writes
-//! stages and the outcome to stdout, one shape after the other. A panic is caught in it and is that shape's
-//! failure. What ends the process (an abort, a stack overflow, memory beyond its limit) or holds it beyond
-//! the time allowed costs one process; the next shape gets a new one.
+//! A worker is the same program again (`coseg worker`): it reads what is to be done from stdin, does it ([`inside`]),
+//! and writes stages and the outcome to stdout, one piece of work after the other. A panic is caught in it and is
+//! that shape's failure. What ends the process (an abort, a stack overflow, memory beyond its limit) or holds it
+//! beyond the time allowed costs one process; the next shape gets a new one.
+//!
+//! Workers that describe see bytes only. Those that place open the library beside the daemon, which keeps its own
+//! hands off the collection meanwhile; a worker that is killed in the middle of a commit leaves what a crash leaves:
+//! nothing, or all of it.
 
-use crate::library::Failure;
+mod inside;
+
+pub(crate) use inside::{Outcome, Said, outcome, panicked};
+pub use inside::{POISON_VARIABLE, run_worker};
+
 use crate::library::isolate::{self, DescribeJob, Described};
-use rustix::process::{Resource, Rlimit, getppid, getrlimit, setrlimit};
 use serde_json::{Value, json};
 use std::collections::VecDeque;
-use std::io::{self, BufRead as _, BufReader, Read, Write};
+use std::io::{self, BufRead as _, BufReader, Read, Write as _};
 use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::process::{Child, ChildStdin, Command, ExitCode, Stdio};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 /// The subcommand that is a worker.
 pub const WORKER_COMMAND: &str = "worker";
-/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc) in a mesh does as it says, in
-/// the worker. For tests of the isolation; no client can set it.
-pub const POISON_VARIABLE: &str = "COSEG_TEST_POISON";
 /// Between looks at whether the work is still wanted.
 const LOOK: Duration = Duration::from_millis(50);
 /// A worker that has described a larger file is not used again: its memory is given back.
 const LARGE_FILE: usize = 8 << 20;
-/// Address space of a worker beyond what the work is estimated to take: stacks, allocator, margin.
-const MEMORY_MARGIN: u64 = 256 << 20;
+/// Address space of a worker beyond what the work is estimated to take: stacks, allocator, and meshes whose spectrum
+/// has thousands of equal eigenvalues.
+const MEMORY_MARGIN: u64 = 768 << 20;
+/// Address space for placing, beside what reading the mesh file again takes: the arrays of forty representatives
+/// and what discovery keeps of them.
+const PLACE_MEMORY: u64 = 2 << 30;
 /// Lines of stderr that are kept to say why a worker ended.
 const KEPT_LINES: usize = 4;
 /// Threads of all workers together, for each processor.
@@ -54,9 +62,22 @@ pub(crate) enum Ended {
     },
 }
 
+/// What is to be done in a worker that opens the library.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Placing<'a> {
+    /// Place the shape that was handed over ([`crate::Library::hand_over`]), whose file has so many bytes.
+    Place(&'a Value, u64),
+    /// Label one stale shape of a collection anew.
+    Relabel(&'a str),
+}
+
 /// Workers that wait for work.
 pub(crate) struct Pool {
-    idle: Mutex<Vec<Process>>,
+    describing: Mutex<Vec<Process>>,
+    /// With the collection that each has served last, and still knows.
+    placing: Mutex<Vec<(String, Process)>>,
+    library: PathBuf,
+    n_workers: usize,
     threads: usize,
 }
 
@@ -67,13 +88,21 @@ struct Process {
     said: Arc<Mutex<VecDeque<String>>>,
 }
 
+fn locked<T>(kept: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    // Processes are pushed and popped, which nothing interrupts half-way.
+    kept.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Pool {
-    /// Starts the first worker, to see that it can be.
-    pub(crate) fn new(n_workers: usize) -> io::Result<Self> {
+    /// Starts the first worker, to see that it can be. `library` is the folder of the open library.
+    pub(crate) fn new(library: &Path, n_workers: usize) -> io::Result<Self> {
         let processors = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = THREADS_PER_PROCESSOR * processors / n_workers.max(1);
         let pool = Self {
-            idle: Mutex::new(Vec::new()),
+            describing: Mutex::default(),
+            placing: Mutex::default(),
+            library: library.to_path_buf(),
+            n_workers: n_workers.max(1),
             threads: threads.clamp(1, processors),
         };
         let first = Process::start(pool.threads)?;
@@ -81,12 +110,19 @@ impl Pool {
             Ok((READY, _)) => {}
             _ => return Err(io::Error::other(first.into_death().0)),
         }
-        pool.idle().push(first);
+        locked(&pool.describing).push(first);
         Ok(pool)
     }
 
-    fn idle(&self) -> std::sync::MutexGuard<'_, Vec<Process>> {
-        self.idle.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Ends the workers that wait for work.
+    pub(crate) fn close(&self) {
+        locked(&self.describing).clear();
+        locked(&self.placing).clear();
+    }
+
+    fn or_start(&self, kept: Option<Process>) -> Result<Process, Ended> {
+        let process = kept.map_or_else(|| Process::start(self.threads), Ok);
+        process.map_err(|e| Ended::died(format!("a worker process cannot be started: {e}")))
     }
 
     /// Describes in a worker. `memory` is what the work is estimated to take; `stage` is told each stage, and
@@ -98,45 +134,57 @@ impl Pool {
         stage: &dyn Fn(&str),
         wanted: &dyn Fn() -> bool,
     ) -> Result<Described, Ended> {
-        let kept = self.idle().pop();
-        let mut process = match kept.map_or_else(|| Process::start(self.threads), Ok) {
-            Ok(process) => process,
-            Err(e) => {
-                return Err(Ended::Died {
-                    text: format!("a worker process cannot be started: {e}"),
-                    out_of_memory: false,
-                });
-            }
-        };
+        let kept = locked(&self.describing).pop();
         let mut header = job.header();
         header["memory"] = json!(MEMORY_MARGIN + 2 * memory);
-        if process.send(&header, job.bytes).is_err() {
-            return Err(process.into_died());
+        let process = self.or_start(kept)?;
+        let (outcome, process) = process.run(&header, job.bytes, stage, wanted)?;
+        let outcome = isolate::decode(&outcome).map_err(|e| Ended::died(e.to_string()))?;
+        if job.bytes.len() <= LARGE_FILE {
+            locked(&self.describing).push(process);
         }
-        loop {
-            match process.frames.recv_timeout(LOOK) {
-                Ok((STAGE, name)) => stage(&String::from_utf8_lossy(&name)),
-                Ok((OUTCOME, bytes)) => {
-                    let outcome = isolate::decode(&bytes);
-                    return match outcome {
-                        Ok(outcome) => {
-                            if job.bytes.len() <= LARGE_FILE {
-                                self.idle().push(process);
-                            }
-                            Ok(outcome)
-                        }
-                        Err(e) => Err(Ended::Died {
-                            text: e.to_string(),
-                            out_of_memory: false,
-                        }),
-                    };
-                }
-                Ok(_) | Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return Err(process.into_died()),
+        Ok(outcome)
+    }
+
+    /// Places, or labels anew, in a worker. Whoever calls this keeps this process from using the collection.
+    pub(crate) fn place(
+        &self,
+        collection: &str,
+        work: Placing<'_>,
+        wanted: &dyn Fn() -> bool,
+    ) -> Result<Value, Ended> {
+        let mut header = json!({ "library": self.library, "memory": PLACE_MEMORY });
+        match work {
+            Placing::Place(handed, n_bytes) => {
+                header["place"] = handed.clone();
+                // Where boundaries are refined, the file is read once more.
+                let reading = crate::config::Limits::to_describe(n_bytes);
+                header["memory"] = json!(PLACE_MEMORY + 2 * reading);
             }
-            if !wanted() {
-                return Err(Ended::Stopped);
-            }
+            Placing::Relabel(collection) => header["relabel"] = json!(collection),
+        }
+        let kept = {
+            let mut idle = locked(&self.placing);
+            let at = idle.iter().rposition(|(served, _)| served == collection);
+            // Starting another is dearer than learning another collection.
+            at.or(idle.len().checked_sub(1)).map(|at| idle.remove(at).1)
+        };
+        let process = self.or_start(kept)?;
+        let (outcome, process) = process.run(&header, &[], &|_| {}, wanted)?;
+        let outcome = serde_json::from_slice(&outcome).map_err(|e| Ended::died(e.to_string()))?;
+        let mut idle = locked(&self.placing);
+        if idle.len() < self.n_workers {
+            idle.push((collection.to_owned(), process));
+        }
+        Ok(outcome)
+    }
+}
+
+impl Ended {
+    fn died(text: String) -> Self {
+        Self::Died {
+            text,
+            out_of_memory: false,
         }
     }
 }
@@ -189,6 +237,30 @@ impl Process {
             frames,
             said,
         })
+    }
+
+    /// Sends work, and gives the outcome back together with the process, which can take more.
+    fn run(
+        mut self,
+        header: &Value,
+        bytes: &[u8],
+        stage: &dyn Fn(&str),
+        wanted: &dyn Fn() -> bool,
+    ) -> Result<(Vec<u8>, Self), Ended> {
+        if self.send(header, bytes).is_err() {
+            return Err(self.into_died());
+        }
+        loop {
+            match self.frames.recv_timeout(LOOK) {
+                Ok((STAGE, name)) => stage(&String::from_utf8_lossy(&name)),
+                Ok((OUTCOME, outcome)) => return Ok((outcome, self)),
+                Ok(_) | Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return Err(self.into_died()),
+            }
+            if !wanted() {
+                return Err(Ended::Stopped);
+            }
+        }
     }
 
     fn send(&mut self, header: &Value, bytes: &[u8]) -> io::Result<()> {
@@ -272,122 +344,4 @@ fn read_frame(input: &mut impl Read) -> io::Result<(u8, Vec<u8>)> {
     let mut kind = [0];
     input.read_exact(&mut kind)?;
     Ok((kind[0], read_bytes(input)?))
-}
-
-fn write_frame(kind: u8, bytes: &[u8]) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    out.write_all(&[kind])?;
-    out.write_all(&(bytes.len() as u64).to_le_bytes())?;
-    out.write_all(bytes)?;
-    out.flush()
-}
-
-/// Is a worker until its input ends: the body of `coseg worker`.
-pub fn run_worker() -> ExitCode {
-    match work() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) if e.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
-        Err(e) => {
-            eprintln!("worker: {e}");
-            ExitCode::FAILURE
-        }
-    }
-}
-
-fn work() -> io::Result<()> {
-    // A worker writes no files and leaves no core.
-    for resource in [Resource::Core, Resource::Fsize] {
-        let none = Rlimit {
-            current: Some(0),
-            maximum: Some(0),
-        };
-        setrlimit(resource, none)?;
-    }
-    end_with_parent()?;
-    let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
-    let mut input = BufReader::new(io::stdin().lock());
-    write_frame(READY, &[])?;
-    loop {
-        let header = match read_bytes(&mut input) {
-            Ok(header) => header,
-            Err(e) if e.kind() == io::ErrorKind::UnexpectedEof => return Ok(()),
-            Err(e) => return Err(e),
-        };
-        let header: Value = serde_json::from_slice(&header)?;
-        limit_memory(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
-        let bytes = read_bytes(&mut input)?;
-        let job = DescribeJob::from_header(&header, &bytes).map_err(io::Error::other)?;
-        let stage = |name: &str| write_frame(STAGE, name.as_bytes()).is_ok();
-        let described = catch_unwind(AssertUnwindSafe(|| {
-            if poisoned {
-                take_poison(&bytes);
-            }
-            job.run(&stage)
-        }));
-        let outcome = described.unwrap_or_else(|panic| {
-            let text = super::panic_text(panic.as_ref());
-            Err(Failure {
-                code: "INTERNAL".to_owned(),
-                reason: "PANIC".to_owned(),
-                message: format!("the work on this shape panicked: {text}"),
-                subject: None,
-            })
-        });
-        write_frame(OUTCOME, &isolate::encode(&outcome))?;
-    }
-}
-
-/// Allows `more` bytes of address space beyond what is in use.
-fn limit_memory(more: u64) -> io::Result<()> {
-    let status = std::fs::read_to_string("/proc/self/status")?;
-    let in_use = status
-        .lines()
-        .find_map(|l| l.strip_prefix("VmSize:")?.trim().strip_suffix(" kB"))
-        .and_then(|n| n.trim().parse::<u64>().ok())
-        .ok_or_else(|| io::Error::other("the kernel does not say how large this process is"))?
-        << 10;
-    let maximum = getrlimit(Resource::As).maximum;
-    let current = in_use + more;
-    setrlimit(
-        Resource::As,
-        Rlimit {
-            current: Some(maximum.map_or(current, |m| m.min(current))),
-            maximum,
-        },
-    )?;
-    Ok(())
-}
-
-/// Ends this process within a second after the daemon has, whatever it is at.
-fn end_with_parent() -> io::Result<()> {
-    let parent = getppid();
-    std::thread::Builder::new()
-        .name("parent".to_owned())
-        .spawn(move || {
-            while getppid() == parent {
-                std::thread::sleep(Duration::from_millis(500));
-            }
-            std::process::exit(1);
-        })?;
-    Ok(())
-}
-
-/// Does what a test's mesh asks for in a comment.
-fn take_poison(bytes: &[u8]) {
-    let text = String::from_utf8_lossy(&bytes[..bytes.len().min(256)]);
-    let Some((_, poison)) = text.split_once("poison: ") else {
-        return;
-    };
-    match poison.split_whitespace().next().unwrap_or_default() {
-        "panic" => panic!("poisoned"),
-        "abort" => std::process::abort(),
-        "loop" => loop {
-            std::hint::spin_loop();
-        },
-        "alloc" => {
-            let much = vec![1_u8; 100 << 30];
-            std::hint::black_box(&much);
-        }
-        _ => {}
-    }
 }

@@ -1,0 +1,340 @@
+//! A lane places the described shapes of one collection, strictly in order of acceptance. With nothing to place it labels
+//! stale shapes anew.
+//!
+//! The work is done in workers, as describing is; what ends a worker is counted with what ended others over the same
+//! shape. A worker commits by itself, so what became of a shape is what the catalog says.
+
+use crate::daemon::publish::Notice;
+use crate::daemon::work::{
+    MAX_ATTEMPTS, Outcome, Prepared, Step, cancelled, died, failed, note_death, prepare, too_long,
+};
+use crate::daemon::worker::{self, Ended, Placing, panicked};
+use crate::daemon::{Daemon, blocking};
+use crate::ipc::convert;
+use crate::library::{Described, Failure, ItemState, JobItem, LibraryError};
+use crate::store::StoreError;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, oneshot};
+
+/// Delay before a failed write is tried again, doubled each time.
+const FIRST_RETRY: Duration = Duration::from_secs(1);
+const LAST_RETRY: Duration = Duration::from_secs(30);
+/// Refusals of the library to place what was cancelled meanwhile.
+const CANCELLED: &str = "CANCELLED";
+
+/// A collection's lane.
+pub(crate) async fn place_in_order(
+    daemon: Arc<Daemon>,
+    collection: String,
+    mut steps: mpsc::UnboundedReceiver<Step>,
+) {
+    let mut relabel = true;
+    let mut n_deaths = 0;
+    loop {
+        let step = match steps.try_recv() {
+            Ok(step) => step,
+            Err(mpsc::error::TryRecvError::Empty) if relabel => {
+                relabel = relabel_next(&daemon, &collection, &mut n_deaths).await;
+                continue;
+            }
+            Err(_) => match steps.recv().await {
+                Some(step) => step,
+                None => return,
+            },
+        };
+        let mut ready = match step {
+            Step::Place(ready) => ready,
+            Step::Relabel => {
+                (relabel, n_deaths) = (true, 0);
+                continue;
+            }
+        };
+        let prepared = loop {
+            match ready.prepared.try_recv() {
+                Ok(prepared) => break Ok(prepared),
+                Err(oneshot::error::TryRecvError::Empty) if relabel => {
+                    relabel = relabel_next(&daemon, &collection, &mut n_deaths).await;
+                }
+                Err(_) => break (&mut ready.prepared).await,
+            }
+        };
+        // Draining: this shape and all after it stay queued.
+        let Ok((prepared, _memory)) = prepared else {
+            return;
+        };
+        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else {
+            return;
+        };
+        if !place(&daemon, &ready.item, outcome).await {
+            return;
+        }
+        relabel = true;
+    }
+}
+
+/// What is to be placed, now that all before it are. `None`: the daemon drains.
+async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
+    if let Prepared::Described(outcome) = prepared {
+        return Some(*outcome);
+    }
+    let subject = item.clone();
+    // A shape before it may have removed the reason why no description was needed.
+    let settled = blocking(daemon, move |d| match prepare(d, &subject) {
+        Prepared::Described(outcome) => *outcome,
+        // The library sees by itself why, before it looks at this.
+        Prepared::NotNeeded => Err(failed(
+            "INTERNAL",
+            "GONE",
+            "it was not described".to_owned(),
+        )),
+    });
+    let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
+    (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
+}
+
+/// Places one shape and commits. False: the daemon drains and the shape stays queued.
+async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bool {
+    if daemon.work.progress().is_cancelled(item.job) {
+        outcome = Err(cancelled());
+    }
+    daemon.work.progress().set_stage(item, "place");
+    daemon.work.changed();
+    let mut delay = FIRST_RETRY;
+    let mut draining = daemon.drain.subscribe();
+    loop {
+        let permit = Arc::clone(&daemon.placing).acquire_owned().await;
+        let (again, subject) = (outcome.clone(), item.clone());
+        let placed = blocking(daemon, move |d| place_apart(d, &subject, again)).await;
+        drop(permit);
+        let failure = match placed {
+            Ok(Ok(state)) => {
+                report(daemon, item, &state);
+                break;
+            }
+            // Nothing was written: there may be space again, or a restart, and the shape is still queued.
+            Ok(Err(LibraryError::Store(
+                e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
+            ))) => {
+                daemon.metrics.fault("place");
+                tracing::error!(
+                    collection = item.collection, shape = item.name, error = %e,
+                    "a shape cannot be stored; trying again in {} s", delay.as_secs()
+                );
+                tokio::select! {
+                    () = tokio::time::sleep(delay) => {}
+                    _ = draining.wait_for(|&d| d) => return false,
+                }
+                delay = (delay * 2).min(LAST_RETRY);
+                continue;
+            }
+            Ok(Err(e)) => convert::library_failure(&e),
+            Err(panic) => panicked(&panic),
+        };
+        if outcome.is_err() {
+            // Not even the failure can be recorded: the collection or the job is gone.
+            tracing::warn!(
+                collection = item.collection,
+                shape = item.name,
+                job = item.job,
+                message = failure.message,
+                "a shape was dropped"
+            );
+            break;
+        }
+        outcome = Err(failure);
+    }
+    daemon.work.progress().finish(item);
+    daemon.work.changed();
+    daemon.notice(Notice::Changed(item.collection.clone()));
+    true
+}
+
+/// Places one shape in a worker, if there is anything to place. Waits for the collection.
+fn place_apart(
+    daemon: &Arc<Daemon>,
+    item: &JobItem,
+    outcome: Outcome,
+) -> Result<ItemState, LibraryError> {
+    let library = &daemon.library;
+    let described = match outcome {
+        Ok(described) => described,
+        // To write down why not is work for nobody else.
+        Err(why) => return library.place_item(item, Err(why)),
+    };
+    let lent = library.lend(&item.collection, || try_to_place(daemon, item, &described));
+    match lent {
+        Ok(Ok(Ok(()))) => library.item_state(item),
+        Ok(Ok(Err(why))) => library.place_item(item, Err(why)),
+        Ok(Err(e)) => Err(e),
+        // The collection is gone, which is written down as well.
+        Err(LibraryError::NotFound { .. }) => library.place_item(item, Ok(described)),
+        Err(e) => Err(e),
+    }
+}
+
+/// The attempts to place one shape. The inner error is why the shape has failed; otherwise the catalog says what
+/// became of it.
+fn try_to_place(
+    daemon: &Arc<Daemon>,
+    item: &JobItem,
+    described: &Described,
+) -> Result<Result<(), Failure>, LibraryError> {
+    let library = &daemon.library;
+    let handed = library.hand_over(item, described)?;
+    let n_bytes = library.item_bytes(item)?;
+    let begin = Instant::now();
+    let limit = Duration::from_secs(daemon.config().work.shape_seconds);
+    let is_cancelled = || daemon.work.progress().is_cancelled(item.job);
+    let wanted = || begin.elapsed() < limit && !is_cancelled();
+    loop {
+        let work = Placing::Place(&handed, n_bytes);
+        let (text, out_of_memory) = match daemon.pool.place(&item.collection, work, &wanted) {
+            Ok(said) => match understood(daemon, &said)? {
+                worker::Outcome::Failed(why) if why.reason == CANCELLED => return Ok(Ok(())),
+                worker::Outcome::Failed(why) => return Ok(Err(why)),
+                worker::Outcome::State(_) | worker::Outcome::Relabelled(_) => return Ok(Ok(())),
+            },
+            Err(Ended::Stopped) => {
+                // It may have been done in that moment.
+                let state = library.item_state(item)?;
+                return Ok(match state {
+                    ItemState::Queued | ItemState::Running(_) if is_cancelled() => Err(cancelled()),
+                    ItemState::Queued | ItemState::Running(_) => {
+                        Err(too_long("placing", begin.elapsed(), limit))
+                    }
+                    _ => Ok(()),
+                });
+            }
+            Err(Ended::Died {
+                text,
+                out_of_memory,
+            }) => (text, out_of_memory),
+        };
+        match note_death(daemon, item, &text)? {
+            // It was done, or cancelled, before the worker ended.
+            0 => return Ok(Ok(())),
+            n if n >= MAX_ATTEMPTS => return Ok(Err(died(&text, out_of_memory, n))),
+            _ => {}
+        }
+    }
+}
+
+/// What a worker says; what its disk says counts for this process too.
+fn understood(daemon: &Daemon, said: &serde_json::Value) -> Result<worker::Outcome, LibraryError> {
+    match worker::outcome(said) {
+        Ok(worker::Said::Outcome(outcome)) => Ok(outcome),
+        Ok(worker::Said::NoSpace(path)) => Err(StoreError::NoSpace { path }.into()),
+        Ok(worker::Said::ReadOnly(cause)) => {
+            Err(daemon.library.store().health().stop(cause).into())
+        }
+        Err(text) => Ok(worker::Outcome::Failed(failed(
+            "INTERNAL",
+            "WORKER_DIED",
+            text,
+        ))),
+    }
+}
+
+fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
+    let (collection, shape) = (&item.collection, &item.name);
+    match state {
+        ItemState::Done(placed) => {
+            daemon.metrics.placed(placed);
+            tracing::info!(
+                collection, shape, outcome = ?placed.outcome, version = placed.version,
+                ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
+            );
+        }
+        ItemState::Failed(f) => {
+            daemon.metrics.finished("failed");
+            daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(
+                collection,
+                shape,
+                code = f.code,
+                reason = f.reason,
+                message = f.message,
+                "failed"
+            );
+        }
+        ItemState::Cancelled => {
+            daemon.metrics.finished("cancelled");
+            tracing::info!(collection, shape, "cancelled");
+        }
+        ItemState::Queued | ItemState::Running(_) => {
+            tracing::error!(collection, shape, "was placed but is not over");
+        }
+    }
+}
+
+/// Labels one stale shape of the collection anew. False: none was stale, or not now. What ends its worker too often is not
+/// tried again before something changes.
+async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32) -> bool {
+    if daemon.is_draining() || *n_deaths >= MAX_ATTEMPTS {
+        return false;
+    }
+    let permit = Arc::clone(&daemon.placing).acquire_owned().await;
+    let name = collection.to_owned();
+    let relabelled = blocking(daemon, move |d| relabel_apart(d, &name)).await;
+    drop(permit);
+    let fault = |error: &str| {
+        daemon.metrics.fault("relabel");
+        tracing::error!(collection, error, "a stale shape cannot be labelled anew");
+    };
+    let again = match relabelled {
+        Ok(Ok(Ok(again))) => {
+            *n_deaths = 0;
+            again
+        }
+        Ok(Ok(Err(death))) => {
+            *n_deaths += 1;
+            daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+            fault(&death);
+            return *n_deaths < MAX_ATTEMPTS;
+        }
+        Ok(Err(LibraryError::NotFound { .. })) => false,
+        Ok(Err(e)) => {
+            fault(&e.to_string());
+            false
+        }
+        Err(panic) => {
+            fault(&format!("it panicked: {panic}"));
+            false
+        }
+    };
+    if again {
+        daemon.metrics.relabelled.inc();
+        daemon.notice(Notice::Changed(collection.to_owned()));
+    }
+    daemon.work.changed();
+    again
+}
+
+/// Whether a shape was labelled anew. The inner error says what ended the worker.
+fn relabel_apart(
+    daemon: &Arc<Daemon>,
+    collection: &str,
+) -> Result<Result<bool, String>, LibraryError> {
+    let library = &daemon.library;
+    // Most often there is nothing to do, which needs no worker to be seen.
+    if !library.has_stale(collection)? {
+        return Ok(Ok(false));
+    }
+    library.store().health().writable()?;
+    let begin = Instant::now();
+    let limit = Duration::from_secs(daemon.config().work.shape_seconds);
+    let wanted = || begin.elapsed() < limit;
+    let work = Placing::Relabel(collection);
+    let said = library.lend(collection, || daemon.pool.place(collection, work, &wanted))?;
+    match said {
+        Ok(said) => match understood(daemon, &said)? {
+            worker::Outcome::Relabelled(again) => Ok(Ok(again)),
+            worker::Outcome::Failed(why) => Ok(Err(why.message)),
+            worker::Outcome::State(state) => Ok(Err(format!("a worker said {state:?}"))),
+        },
+        Err(Ended::Stopped) => Ok(Err(format!("it took more than {} s", limit.as_secs()))),
+        Err(Ended::Died { text, .. }) => Ok(Err(text)),
+    }
+}

@@ -1,0 +1,278 @@
+//! What a worker does: the same program in its other role.
+
+use super::{MEMORY_MARGIN, OUTCOME, READY, STAGE, read_bytes};
+use crate::daemon::panic_text;
+use crate::ipc::convert;
+use crate::library::isolate::{self, DescribeJob};
+use crate::library::{Failure, ItemState, LibraryError};
+use crate::store::StoreError;
+use crate::{Library, library};
+use rustix::process::{Resource, Rlimit, getrlimit, nice, setrlimit};
+use serde_json::{Value, json};
+use std::io::{self, Read, Write as _};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::mpsc;
+
+/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, stack) in a mesh does as it says
+/// while the shape is described, and `poison: abort-placing` (and so on) while it is placed, in the worker. For tests of
+/// the isolation; no client can set it.
+pub const POISON_VARIABLE: &str = "COSEG_TEST_POISON";
+/// Workers give way to the daemon, which has to answer meanwhile.
+const NICENESS: i32 = 5;
+/// Bytes at the beginning of a mesh that poison is looked for in.
+const POISON_BYTES: usize = 256;
+
+/// A header with the bytes that belong to it.
+type Work = (Value, Vec<u8>);
+
+/// Is a worker until its input ends: the body of `coseg worker`.
+pub fn run_worker() -> ExitCode {
+    match work() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) if e.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("worker: {e}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn work() -> io::Result<()> {
+    // A worker leaves no core.
+    forbid(Resource::Core)?;
+    // Refused where the service manager does not let it: then it is as urgent as the daemon.
+    let _ = nice(NICENESS);
+    let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
+    let mut library = None;
+    let work = read_ahead()?;
+    write_frame(READY, &[])?;
+    for next in work {
+        let (header, bytes) = next?;
+        limit_memory(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
+        let outcome = if header["library"].is_string() {
+            place(&header, &mut library, poisoned)
+                .to_string()
+                .into_bytes()
+        } else {
+            // One that describes writes no files.
+            forbid(Resource::Fsize)?;
+            describe(&header, &bytes, poisoned)?
+        };
+        write_frame(OUTCOME, &outcome)?;
+    }
+    Ok(())
+}
+
+/// Reads in a thread of its own, which ends this process as soon as the input ends, because the daemon has, whatever
+/// the process is at.
+fn read_ahead() -> io::Result<mpsc::Receiver<io::Result<Work>>> {
+    let (sender, work) = mpsc::sync_channel(0);
+    std::thread::Builder::new()
+        .name("input".to_owned())
+        .spawn(move || {
+            let mut input = io::stdin().lock();
+            loop {
+                let next = read_work(&mut input);
+                let ended = |e: &io::Error| e.kind() == io::ErrorKind::UnexpectedEof;
+                if next.as_ref().is_err_and(ended) {
+                    std::process::exit(0);
+                }
+                if sender.send(next).is_err() {
+                    return;
+                }
+            }
+        })?;
+    Ok(work)
+}
+
+fn read_work(input: &mut impl Read) -> io::Result<Work> {
+    let header = serde_json::from_slice(&read_bytes(input)?)?;
+    Ok((header, read_bytes(input)?))
+}
+
+fn describe(header: &Value, bytes: &[u8], poisoned: bool) -> io::Result<Vec<u8>> {
+    let job = DescribeJob::from_header(header, bytes).map_err(io::Error::other)?;
+    let stage = |name: &str| write_frame(STAGE, name.as_bytes()).is_ok();
+    let described = catch_unwind(AssertUnwindSafe(|| {
+        if poisoned {
+            take_poison(bytes, "");
+        }
+        job.run(&stage)
+    }));
+    let outcome = described.unwrap_or_else(|panic| Err(panicked(&panic_text(panic.as_ref()))));
+    Ok(isolate::encode(&outcome))
+}
+
+/// The failure of a shape that something panicked over, which may be for want of memory.
+pub(crate) fn panicked(text: &str) -> Failure {
+    let out_of_memory = ["AllocError", "out of memory"]
+        .iter()
+        .any(|said| text.contains(said));
+    let (code, reason) = match out_of_memory {
+        true => ("RESOURCE_EXHAUSTED", "SHAPE_MEMORY"),
+        false => ("INTERNAL", "PANIC"),
+    };
+    Failure {
+        code: code.to_owned(),
+        reason: reason.to_owned(),
+        message: format!("the work on this shape panicked: {text}"),
+        subject: None,
+    }
+}
+
+/// Places a shape, or labels one anew; what came of it, as [`outcome`] reads it.
+fn place(header: &Value, open: &mut Option<(PathBuf, Library)>, poisoned: bool) -> Value {
+    let placed = catch_unwind(AssertUnwindSafe(|| {
+        let dir = Path::new(header["library"].as_str().unwrap_or_default());
+        if open.as_ref().is_none_or(|(of, _)| of != dir) {
+            *open = Some((dir.to_path_buf(), Library::open_beside(dir)?));
+        }
+        let library = open.as_ref().map(|(_, library)| library);
+        let library = library.expect("invariant: it was just opened");
+        if let Some(collection) = header["relabel"].as_str() {
+            let more = library.relabel_next(Some(collection))?;
+            return Ok(json!({ "more": more }));
+        }
+        let handed = &header["place"];
+        if poisoned {
+            take_poison(&library.handed_bytes(handed)?, "-placing");
+        }
+        let state = library.place_handed(handed)?;
+        Ok(json!({ "state": library::state_to_json(&state) }))
+    }));
+    match placed {
+        Ok(Ok(outcome)) => outcome,
+        Ok(Err(error)) => told(&error),
+        // The lane may be half-way: it is read anew.
+        Err(panic) => {
+            *open = None;
+            json!({ "panic": panic_text(panic.as_ref()) })
+        }
+    }
+}
+
+fn told(error: &LibraryError) -> Value {
+    match error {
+        LibraryError::Store(StoreError::NoSpace { path }) => json!({ "no_space": path }),
+        LibraryError::Store(StoreError::ReadOnly { cause, .. }) => json!({ "read_only": cause }),
+        other => json!({ "error": convert::library_failure(other) }),
+    }
+}
+
+/// What came of work that needs the library.
+#[derive(Debug)]
+pub(crate) enum Outcome {
+    /// The shape is placed, or is over otherwise.
+    State(ItemState),
+    /// Whether a shape was stale, and was labelled anew.
+    Relabelled(bool),
+    /// The library refused or failed.
+    Failed(Failure),
+}
+
+/// What a worker says.
+#[derive(Debug)]
+pub(crate) enum Said {
+    /// Of its work.
+    Outcome(Outcome),
+    /// The disk is full: nothing was changed.
+    NoSpace(String),
+    /// A sync failed in the worker, which ends the writing of the daemon too.
+    ReadOnly(String),
+}
+
+/// Reads what a worker says; the error is for people.
+pub(crate) fn outcome(value: &Value) -> Result<Said, String> {
+    let text = |name: &str| value[name].as_str().map(str::to_owned);
+    if let Some(path) = text("no_space") {
+        return Ok(Said::NoSpace(path));
+    }
+    if let Some(cause) = text("read_only") {
+        return Ok(Said::ReadOnly(cause));
+    }
+    let bad = |e: &dyn std::fmt::Display| format!("a worker said {value}: {e}");
+    Ok(Said::Outcome(if let Some(more) = value["more"].as_bool() {
+        Outcome::Relabelled(more)
+    } else if let Some(text) = text("panic") {
+        Outcome::Failed(panicked(&text))
+    } else if let Some(failure) = value.get("error") {
+        Outcome::Failed(serde_json::from_value(failure.clone()).map_err(|e| bad(&e))?)
+    } else {
+        Outcome::State(library::state_from_json(&value["state"]).map_err(|e| bad(&e))?)
+    }))
+}
+
+fn write_frame(kind: u8, bytes: &[u8]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(&[kind])?;
+    out.write_all(&(bytes.len() as u64).to_le_bytes())?;
+    out.write_all(bytes)?;
+    out.flush()
+}
+
+fn forbid(resource: Resource) -> io::Result<()> {
+    let none = Rlimit {
+        current: Some(0),
+        maximum: Some(0),
+    };
+    Ok(setrlimit(resource, none)?)
+}
+
+/// Allows `more` bytes of address space beyond what is in use.
+fn limit_memory(more: u64) -> io::Result<()> {
+    let status = std::fs::read_to_string("/proc/self/status")?;
+    let in_use = status
+        .lines()
+        .find_map(|l| l.strip_prefix("VmSize:")?.trim().strip_suffix(" kB"))
+        .and_then(|n| n.trim().parse::<u64>().ok())
+        .ok_or_else(|| io::Error::other("the kernel does not say how large this process is"))?
+        << 10;
+    let maximum = getrlimit(Resource::As).maximum;
+    let current = in_use + more;
+    setrlimit(
+        Resource::As,
+        Rlimit {
+            current: Some(maximum.map_or(current, |m| m.min(current))),
+            maximum,
+        },
+    )?;
+    Ok(())
+}
+
+/// Does what a test's mesh asks for in a comment, at the time that `when` says.
+fn take_poison(bytes: &[u8], when: &str) {
+    let text = String::from_utf8_lossy(&bytes[..bytes.len().min(POISON_BYTES)]);
+    let Some((_, poison)) = text.split_once("poison: ") else {
+        return;
+    };
+    let poison = poison.split_whitespace().next().unwrap_or_default();
+    let Some(poison) = poison.strip_suffix(when) else {
+        return;
+    };
+    match poison {
+        "panic" => panic!("poisoned"),
+        "abort" => std::process::abort(),
+        "loop" => loop {
+            std::hint::spin_loop();
+        },
+        "alloc" => {
+            let much = vec![1_u8; 100 << 30];
+            std::hint::black_box(&much);
+        }
+        "stack" => {
+            std::hint::black_box(deeper(1));
+        }
+        _ => {}
+    }
+}
+
+/// Does not come back.
+fn deeper(depth: u64) -> u64 {
+    let here = std::hint::black_box([depth; 512]);
+    if here[0] == u64::MAX {
+        return 0;
+    }
+    deeper(depth + 1).wrapping_add(here[511])
+}

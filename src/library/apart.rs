@@ -1,0 +1,284 @@
+//! Placing in another process: what is handed to it, and what comes back.
+//!
+//! The other process opens the library beside the one that holds it, and commits by itself: a process that dies in the
+//! middle leaves what a crash leaves, which is nothing. The holder lends it the lane of the collection for that time,
+//! and sees by the collection's row that the lane is to be read anew.
+
+use super::rows::{damaged, from_json, to_json};
+use super::{Described, ItemState, JobItem, Library, LibraryError, Result};
+use crate::store::{Digest, ObjectKind, ObjectRow, Store};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::path::Path;
+use std::sync::{Arc, PoisonError};
+use std::time::Instant;
+
+/// Where the other process's words came from, in errors.
+const PLACE: &str = "work handed over";
+
+/// A described shape, on disk, and the item it belongs to.
+#[derive(Debug, Serialize, Deserialize)]
+struct Handed {
+    job: u64,
+    index: u32,
+    collection: String,
+    name: String,
+    digest: String,
+    file: String,
+    length: u64,
+    blake3: String,
+    stages_ms: Vec<(String, f64)>,
+}
+
+impl Handed {
+    fn object(&self) -> Result<ObjectRow> {
+        let digest = |text: &str| -> Result<Digest> {
+            text.parse()
+                .map_err(|e| damaged(PLACE, &format!("{text:?}: {e}")))
+        };
+        Ok(ObjectRow {
+            kind: ObjectKind::Description,
+            digest: digest(&self.digest)?,
+            file: self.file.clone(),
+            length: self.length,
+            blake3: digest(&self.blake3)?,
+        })
+    }
+
+    fn item(&self) -> JobItem {
+        JobItem {
+            job: self.job,
+            index: self.index,
+            collection: self.collection.clone(),
+            name: self.name.clone(),
+            state: ItemState::Queued,
+            attempts: 0,
+        }
+    }
+}
+
+impl Library {
+    /// Opens the library in `dir` beside the process that holds it: the one that started this process, and that lends it
+    /// ([`Library::lend`]) each collection it is to change.
+    ///
+    /// # Errors
+    /// There is no library of this version's format, or it cannot be read.
+    pub fn open_beside(dir: &Path) -> Result<Self> {
+        Ok(Self::over(Store::open_beside(dir)?))
+    }
+
+    /// Runs `work` while nothing else in this process uses the lane of a collection, so that another process can.
+    ///
+    /// # Errors
+    /// There is no such collection.
+    pub fn lend<T>(&self, collection: &str, work: impl FnOnce() -> T) -> Result<T> {
+        let id = self.collection_row(collection)?.id;
+        let slot = Arc::clone(
+            self.lanes
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .entry(id)
+                .or_default(),
+        );
+        let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
+        // The other process reads its own: one copy is enough.
+        *slot = None;
+        Ok(work())
+    }
+
+    /// Makes a description durable, for [`Library::place_handed`] in another process.
+    ///
+    /// # Errors
+    /// The description cannot be stored.
+    pub fn hand_over(&self, item: &JobItem, described: &Described) -> Result<Value> {
+        let begin = Instant::now();
+        let object = self.store.objects().put_description(
+            described.digest,
+            &described.description,
+            &described.params_json,
+        )?;
+        let mut stages_ms = described.stages_ms.clone();
+        stages_ms.push(("store".to_owned(), begin.elapsed().as_secs_f64() * 1e3));
+        let handed = Handed {
+            job: item.job,
+            index: item.index,
+            collection: item.collection.clone(),
+            name: item.name.clone(),
+            digest: object.digest.to_string(),
+            file: object.file,
+            length: object.length,
+            blake3: object.blake3.to_string(),
+            stages_ms,
+        };
+        Ok(serde_json::to_value(handed).expect("invariant: strings and numbers are JSON"))
+    }
+
+    /// [`Library::place_item`] of a description that was handed over.
+    ///
+    /// # Errors
+    /// As for [`Library::place_item`]; the description cannot be read.
+    pub fn place_handed(&self, handed: &Value) -> Result<ItemState> {
+        let handed: Handed = from_json(&handed.to_string(), PLACE)?;
+        let object = handed.object()?;
+        let mapped = self.store.objects().open_description(&object)?;
+        let described = Described {
+            description: mapped.to_description(),
+            digest: object.digest,
+            params_json: mapped.params_json().to_owned(),
+            stages_ms: handed.stages_ms.clone(),
+            stored: Some(object),
+        };
+        self.place_item(&handed.item(), Ok(described))
+    }
+
+    /// The bytes of the mesh file that a handed description was made of.
+    ///
+    /// # Errors
+    /// There is no such item, or its bytes cannot be read.
+    pub fn handed_bytes(&self, handed: &Value) -> Result<Vec<u8>> {
+        let handed: Handed = from_json(&handed.to_string(), PLACE)?;
+        let row = self.item_row(&handed.item())?;
+        self.original_bytes(&row.item.original_digest)
+    }
+
+    /// Whether a shape of a collection waits to be labelled anew.
+    ///
+    /// # Errors
+    /// There is no such collection.
+    pub fn has_stale(&self, collection: &str) -> Result<bool> {
+        let id = self.collection_row(collection)?.id;
+        let next = self
+            .store
+            .catalog()
+            .read(|r| r.next_stale(Some(id)).map_err(LibraryError::from))?;
+        Ok(next.is_some())
+    }
+
+    /// What became of an item, as the catalog says; and notes what another process did for it.
+    ///
+    /// # Errors
+    /// There is no such item.
+    pub fn item_state(&self, item: &JobItem) -> Result<ItemState> {
+        let state = self.item(self.item_row(item)?)?.state;
+        if let ItemState::Done(placed) = &state {
+            self.note(placed);
+        }
+        Ok(state)
+    }
+}
+
+/// The state of an item that is over, for another process.
+pub fn state_to_json(state: &ItemState) -> Value {
+    let value = |text: String| serde_json::from_str::<Value>(&text).unwrap_or_default();
+    match state {
+        ItemState::Queued | ItemState::Running(_) => json!("queued"),
+        ItemState::Cancelled => json!("cancelled"),
+        ItemState::Done(placed) => json!({ "done": value(to_json(placed)) }),
+        ItemState::Failed(why) => json!({ "failed": value(to_json(why)) }),
+    }
+}
+
+/// The same back.
+///
+/// # Errors
+/// The value is not what [`state_to_json`] makes.
+pub fn state_from_json(value: &Value) -> Result<ItemState> {
+    let other = || damaged(PLACE, &format!("{value} is no state"));
+    if let Some(word) = value.as_str() {
+        return match word {
+            "queued" => Ok(ItemState::Queued),
+            "cancelled" => Ok(ItemState::Cancelled),
+            _ => Err(other()),
+        };
+    }
+    if let Some(placed) = value.get("done") {
+        let placed = from_json(&placed.to_string(), PLACE)?;
+        return Ok(ItemState::Done(Box::new(placed)));
+    }
+    let why = value.get("failed").ok_or_else(other)?;
+    Ok(ItemState::Failed(from_json(&why.to_string(), PLACE)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Library, state_from_json, state_to_json};
+    use crate::library::{CollectionSpec, Failure, ItemState, NewShape};
+    use crate::mesh::Format;
+
+    const TETRAHEDRON: &str =
+        "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
+
+    /// Two libraries over one folder stand for two processes.
+    #[test]
+    fn what_is_placed_beside_is_what_the_holder_would_have_placed() {
+        let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+        let holders = dirs.each_ref().map(|d| Library::open(d.path()).unwrap());
+        let beside = Library::open_beside(dirs[0].path()).unwrap();
+        for holder in &holders {
+            let spec = CollectionSpec {
+                name: "c".into(),
+                n_parts: Some(1),
+                ..CollectionSpec::default()
+            };
+            holder.create_collection(&spec, None).unwrap();
+        }
+        for n in 0..4 {
+            let shape = NewShape {
+                name: format!("s{n}"),
+                bytes: TETRAHEDRON
+                    .replace("0 0 1\n3", &format!("0 0 {}\n3", n + 1))
+                    .into(),
+                format: Format::Off,
+                replace: false,
+            };
+            let [first, second] = holders.each_ref().map(|holder| {
+                let job = holder.submit("c", vec![shape.clone()], None).unwrap();
+                let described = holder.describe_item(&job.items[0], &|_| true).unwrap();
+                (job, described)
+            });
+            // The holder uses its lane in between, as corrections do.
+            holders[0]
+                .name_label("c", 0, &format!("part {n}"), None)
+                .ok();
+            let handed = holders[0].hand_over(&first.0.items[0], &first.1).unwrap();
+            let state = holders[0]
+                .lend("c", || beside.place_handed(&handed))
+                .unwrap();
+            let state = state.unwrap();
+            assert!(matches!(state, ItemState::Done(_)), "{state:?}");
+            assert_eq!(holders[0].item_state(&first.0.items[0]).unwrap(), state);
+            holders[1]
+                .place_item(&second.0.items[0], Ok(second.1))
+                .unwrap();
+        }
+        for n in 0..4 {
+            let labels = |l: &Library| l.labels("c", &format!("s{n}"), None).unwrap().labels;
+            assert_eq!(labels(&holders[0]), labels(&holders[1]));
+        }
+        assert_eq!(
+            holders[0]
+                .store()
+                .sweep_orphans(std::time::Duration::ZERO)
+                .unwrap(),
+            [""; 0]
+        );
+    }
+
+    #[test]
+    fn states_come_back() {
+        let failed = Failure {
+            code: "INTERNAL".into(),
+            reason: "PANIC".into(),
+            message: "\"x\"\n".into(),
+            subject: None,
+        };
+        for state in [
+            ItemState::Failed(failed),
+            ItemState::Cancelled,
+            ItemState::Queued,
+        ] {
+            assert_eq!(state_from_json(&state_to_json(&state)).unwrap(), state);
+        }
+        assert!(state_from_json(&serde_json::json!("done")).is_err());
+    }
+}
