@@ -11,8 +11,13 @@ python_tools
 
 step "protocol: lint, and nothing broken since the last release"
 buf lint "$ROOT/proto"
+# What released versions said, as images: `buf build proto --exclude-source-info -o proto/released/VERSION.binpb`.
+for image in "$ROOT"/proto/released/*.binpb; do
+    buf breaking "$ROOT/proto" --against "$image"
+    echo "nothing is broken since $(basename "$image" .binpb)"
+done
 if git -C "$ROOT" rev-parse --git-dir >/dev/null 2>&1; then
-    # Before the first tag: since the commit before.
+    # And since the last tag; before the first one, since the commit before.
     since=$(git -C "$ROOT" describe --tags --abbrev=0 2>/dev/null ||
         git -C "$ROOT" rev-parse -q --verify 'HEAD~1' || git -C "$ROOT" rev-parse HEAD)
     mkdir -p "$WORK/released"
@@ -29,6 +34,9 @@ step "Python: style, types, tests"
     mypy --no-error-summary
     python -m pytest --durations=3
 )
+
+step "documents: what they say to type, and the Python that is no program of its own"
+python "$ROOT/tests/docs/run.py" "$COSEG_BIN"
 
 step "Python: wheel"
 rm -rf "$WORK/wheel"

@@ -1,7 +1,8 @@
-//! `coseg bench`: how good the product is on meshes whose parts are known.
+//! `coseg bench`: how good the product is on meshes whose parts are known, and how fast.
 
 use super::bench_labels::{Category, Run};
 use super::bench_maps::{self, BenchMaps};
+use super::bench_signatures::{self, BenchSignatures};
 use super::demo::{DRAIN_LIMIT, Scratch, log_warnings, start};
 use super::session::{Session, print_line, table};
 use super::{CommandError, Outcome, bench_labels};
@@ -11,6 +12,7 @@ use coseg::ipc::wire;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
+use std::time::Duration;
 
 /// `coseg bench`
 #[derive(Debug, Subcommand)]
@@ -19,6 +21,8 @@ pub(crate) enum Bench {
     Labels(BenchLabels),
     /// Map meshes with known correspondence to each other, and compare
     Maps(BenchMaps),
+    /// Time signatures of points, beside a copy of the eigenvectors they come from
+    Signatures(BenchSignatures),
 }
 
 /// `coseg bench labels`
@@ -43,8 +47,8 @@ pub(crate) struct BenchLabels {
     #[arg(long)]
     estimate: bool,
     /// After the stream, give the shapes that the daemon suggests their true labels, and score the others by label id once
-    /// as many are labelled as each of these numbers says, such as 1,3,5
-    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=100))]
+    /// as many are labelled as each of these numbers says, such as 0,1,3,5 (0: the stream itself, which is always scored)
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=100))]
     exemplars: Vec<u32>,
     /// Only stream: no batch answer, no baselines (which see 60 shapes at most, spread evenly)
     #[arg(long)]
@@ -53,6 +57,11 @@ pub(crate) struct BenchLabels {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 }
+
+/// How long the bench waits at least for an answer of its own daemon, which shares the machine with others' work.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// Shapes at the beginning and at the end of a stream whose times are compared.
+const N_TIMED: usize = 50;
 
 /// Accuracies of one category.
 struct Row {
@@ -77,9 +86,39 @@ impl Row {
     }
 
     fn spread(&self) -> f64 {
-        let a = self.accuracies();
-        let most = a.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        most - a.iter().copied().fold(f64::INFINITY, f64::min)
+        spread(self.accuracies().into_iter())
+    }
+
+    /// Spread between the orders, for each number of labelled shapes.
+    fn spread_with_exemplars(&self) -> Vec<f64> {
+        let n = self.runs.first().map_or(0, |r| r.with_exemplars.len());
+        (0..n)
+            .map(|i| spread(self.runs.iter().map(|r| r.with_exemplars[i])))
+            .collect()
+    }
+
+    /// Orders in which as many labels are in use as there are parts.
+    fn n_right(&self) -> usize {
+        let right = |r: &&Run| r.n_labels == self.n_parts;
+        self.runs.iter().filter(right).count()
+    }
+
+    /// Milliseconds that placing a shape took.
+    fn place_ms(&self) -> f64 {
+        mean(self.runs.iter().flat_map(|r| &r.place_ms).copied())
+    }
+
+    /// What placing the last fifty shapes took over what the first fifty took; `None` with fewer than a hundred.
+    fn place_growth(&self) -> Option<f64> {
+        let of = |r: &Run| {
+            let n = r.place_ms.len();
+            (n >= 2 * N_TIMED).then(|| {
+                let last = mean(r.place_ms[n - N_TIMED..].iter().copied());
+                last / mean(r.place_ms[..N_TIMED].iter().copied())
+            })
+        };
+        let growth: Option<Vec<f64>> = self.runs.iter().map(of).collect();
+        growth.map(|g| mean(g.into_iter()))
     }
 }
 
@@ -87,6 +126,7 @@ pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
     let args = match bench {
         Bench::Labels(args) => args,
         Bench::Maps(args) => return bench_maps::run(args, global),
+        Bench::Signatures(args) => return bench_signatures::run(args, global),
     };
     let categories = bench_labels::categories(&args.data, &args.category, args.limit)?;
     let up = args.up.unwrap_or(wire::Up::Unknown);
@@ -102,10 +142,7 @@ pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
     if global.json {
         print_line(&report(&rows).to_string())?;
     } else {
-        print_line(&table(&lines(
-            &rows,
-            &args.exemplars.iter().copied().collect(),
-        )))?;
+        print_line(&table(&lines(&rows, &counts(args))))?;
     }
     Ok(rows.iter().flat_map(|r| &r.runs).all(|r| r.n_missing == 0))
 }
@@ -125,6 +162,7 @@ fn row(
         let running = start(&scratch.0)?;
         let global = Global {
             endpoint: Some(running.endpoint().to_string()),
+            timeout: global.timeout.max(PATIENCE),
             ..global.clone()
         };
         let mut session = Session::open(&global)?;
@@ -159,9 +197,15 @@ fn row(
     })
 }
 
+/// Numbers of shapes that are labelled by hand, ascending.
+fn counts(args: &BenchLabels) -> BTreeSet<usize> {
+    let counts = args.exemplars.iter().map(|n| *n as usize);
+    counts.filter(|n| *n > 0).collect()
+}
+
 /// How many shapes are labelled by hand, ascending; at least one must be left over to be scored.
 fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, CommandError> {
-    let counts: BTreeSet<usize> = args.exemplars.iter().map(|n| *n as usize).collect();
+    let counts = counts(args);
     let n_shapes = category.shapes.len();
     match counts.last().filter(|n| **n >= n_shapes) {
         Some(n) => Err(CommandError::Usage(format!(
@@ -176,11 +220,27 @@ fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count().max(1) as f64
 }
 
+/// The greatest value less the least.
+fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    let most = values.clone().fold(f64::NEG_INFINITY, f64::max);
+    most - values.fold(f64::INFINITY, f64::min)
+}
+
 /// The table: a line for each category, the mean last.
-fn lines(rows: &[Row], exemplars: &BTreeSet<u32>) -> Vec<Vec<String>> {
-    let mut head = ["category", "shapes", "parts", "found", "streamed", "spread"]
-        .map(str::to_owned)
-        .to_vec();
+fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
+    let mut head = [
+        "category",
+        "shapes",
+        "parts",
+        "found",
+        "right",
+        "place ms",
+        "last/first",
+        "streamed",
+        "spread",
+    ]
+    .map(str::to_owned)
+    .to_vec();
     let others = rows.first().map_or(&[][..], |r| &r.others);
     head.extend(exemplars.iter().map(|n| format!("{n} labelled")));
     head.extend(others.iter().map(|o| o.0.to_owned()));
@@ -192,6 +252,10 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<u32>) -> Vec<Vec<String>> {
             r.n_shapes.to_string(),
             r.n_parts.to_string(),
             format!("{found:.1}"),
+            format!("{}/{}", r.n_right(), r.runs.len()),
+            format!("{:.0}", r.place_ms()),
+            r.place_growth()
+                .map_or_else(String::new, |g| format!("{g:.2}")),
             format!("{:.3}", mean(r.accuracies().into_iter())),
             format!("{:.3}", r.spread()),
         ];
@@ -201,12 +265,11 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<u32>) -> Vec<Vec<String>> {
     }
     let streamed = mean(rows.iter().map(|r| mean(r.accuracies().into_iter())));
     let spread = mean(rows.iter().map(Row::spread));
-    let mut last = vec![
-        "mean".to_owned(),
-        String::new(),
-        String::new(),
-        String::new(),
-    ];
+    let mut last = vec!["mean".to_owned()];
+    last.resize(7, String::new());
+    let n_runs: usize = rows.iter().map(|r| r.runs.len()).sum();
+    let n_right: usize = rows.iter().map(Row::n_right).sum();
+    last[4] = format!("{n_right}/{n_runs}");
     last.extend([format!("{streamed:.3}"), format!("{spread:.3}")]);
     let labelled = |i| mean(rows.iter().map(|r| r.with_exemplars()[i]));
     last.extend((0..exemplars.len()).map(|i| format!("{:.3}", labelled(i))));
@@ -230,6 +293,7 @@ fn report(rows: &[Row]) -> Value {
                     "n_labels": run.n_labels,
                     "n_missing": run.n_missing,
                     "seconds": run.seconds,
+                    "place_ms": run.place_ms,
                     "with_exemplars": run.with_exemplars,
                 })
             })
@@ -245,7 +309,11 @@ fn report(rows: &[Row]) -> Value {
             "n_parts": r.n_parts,
             "accuracy": mean(r.accuracies().into_iter()),
             "spread": r.spread(),
+            "n_right": r.n_right(),
+            "place_ms": r.place_ms(),
+            "place_growth": r.place_growth(),
             "with_exemplars": r.with_exemplars(),
+            "spread_with_exemplars": r.spread_with_exemplars(),
             "orders": runs,
             "others": others,
         })

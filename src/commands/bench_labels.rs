@@ -17,7 +17,8 @@ use coseg::labels::{Baseline, DiscoveryOptions};
 use coseg::library::Library;
 use coseg::mesh::{self, Format, TriMesh};
 use coseg::pipeline::{
-    DescriptionView, Labelling, Prepared, ReclusterOptions, Representative, batch, label, recluster,
+    DescriptionView, Labelling, Prepared, ReclusterOptions, Representative, batch, label, literal,
+    recluster,
 };
 use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
@@ -29,6 +30,8 @@ use std::time::Instant;
 const TRUTH: &str = ".labels.txt";
 /// Name of the one collection of a daemon.
 const COLLECTION: &str = "bench";
+/// The stages after a shape is described.
+const PLACING: [&str; 4] = ["store", "place", "recluster", "boundary"];
 /// Most shapes that are labelled at once in process: the cost grows with the square.
 const MAX_TOGETHER: usize = 60;
 
@@ -56,6 +59,8 @@ pub(crate) struct Run {
     pub(crate) n_labels: usize,
     pub(crate) n_missing: usize,
     pub(crate) seconds: f64,
+    /// Milliseconds that placing each shape took, in the order of arrival: all that comes after its description.
+    pub(crate) place_ms: Vec<f64>,
     /// Accuracy of the others after some shapes were labelled by hand, for each number of them that was asked for.
     pub(crate) with_exemplars: Vec<f64>,
     labels: Vec<Option<Vec<i32>>>,
@@ -205,6 +210,7 @@ pub(crate) fn stream(
         operator: None,
         working_faces: None,
     };
+    let mut place_ms = Vec::with_capacity(category.shapes.len());
     for i in arrival(category.shapes.len(), order) {
         let shape = &category.shapes[i];
         let encoded = wire::EncodedMesh {
@@ -226,7 +232,7 @@ pub(crate) fn stream(
             (reply::Result::AddShapes(reply), _) => reply.job_id,
             (other, _) => return Err(unexpected(&other).into()),
         };
-        wait(job_id, session)?;
+        place_ms.extend(wait(job_id, session)?);
     }
     let labels = labels_now(category, session)?;
     let score = scored(&category.name, category.shapes.iter(), &labels)?;
@@ -237,6 +243,7 @@ pub(crate) fn stream(
         n_labels: score.n_predicted_labels,
         n_missing: score.n_missing,
         seconds: begin.elapsed().as_secs_f64(),
+        place_ms,
         with_exemplars: Vec::new(),
         labels,
     })
@@ -326,10 +333,20 @@ pub(crate) fn with_exemplars(
     Ok(accuracies)
 }
 
-fn wait(job_id: u64, session: &mut Session) -> Result<(), CommandError> {
+/// Waits for a job; milliseconds that placing each of its shapes took.
+fn wait(job_id: u64, session: &mut Session) -> Result<Vec<f64>, CommandError> {
     let mut revision = 0;
-    while !session.watch_job(job_id, &mut revision)?.finished {}
-    Ok(())
+    loop {
+        let job = session.watch_job(job_id, &mut revision)?;
+        if job.finished {
+            let of_shape = |item: wire::JobItem| {
+                let stages = item.placed.unwrap_or_default().stages.into_iter();
+                let placing = stages.filter(|s| PLACING.contains(&s.stage.as_str()));
+                placing.map(|s| s.ms).sum()
+            };
+            return Ok(job.items.into_iter().map(of_shape).collect());
+        }
+    }
 }
 
 /// Writes the labels of a run, one file a shape.
@@ -386,6 +403,11 @@ pub(crate) fn others(
     for (which, name) in Baseline::ALL {
         out.push((name, accuracy(batch(&views, k, up, Some(which)))?));
     }
+    let seed = DiscoveryOptions::default().seed;
+    let literally = literal(&views, k, seed).map_err(|e| {
+        CommandError::Failed(format!("{}, the paper literally: {e}", category.name))
+    })?;
+    out.push(("the paper literally", accuracy(literally)?));
     Ok(out)
 }
 

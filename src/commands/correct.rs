@@ -55,6 +55,7 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             "area_share": done.area_share,
             "changed_share": done.changed_share,
             "n_shapes": done.n_stale,
+            "job_id": done.job_id,
         }))?;
     } else {
         let carried = if args.no_wait {

@@ -1,22 +1,20 @@
 //! `coseg describe`: the pure stage without a daemon.
 
+use super::describe_full::{Signatures, full};
 use super::session::print_line;
 use super::{CommandError, Outcome};
 use crate::cli::Global;
 use clap::Args;
-use coseg::descriptors::{hks, hks_times};
 use coseg::library::report_to_json;
-use coseg::mesh::{self, CleanReport, Format, TriMesh};
-use coseg::operators::Laplacian;
-use coseg::pipeline::{DescribeError, N_HKS_TIMES, Params, describe, spectrum_of};
+use coseg::mesh::{CleanReport, Format};
+use coseg::pipeline::{Params, describe};
 use coseg::spectrum::Certificate;
-use coseg::store::write_description;
-use safetensors::tensor::{Dtype, TensorView, serialize};
+use coseg::store::DescriptionFile;
 use serde_json::{Value, json};
 use std::cell::RefCell;
-use std::collections::HashMap;
 use std::fs;
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// `coseg describe`
@@ -51,7 +49,7 @@ pub(crate) struct Describe {
 /// Milliseconds by stage, in the order in which stages were first entered. What a stage `a.b` takes
 /// counts for `a` too; one that is entered again goes on counting.
 #[derive(Default)]
-struct Laps(RefCell<Running>);
+pub(super) struct Laps(RefCell<Running>);
 
 #[derive(Default)]
 struct Running {
@@ -62,7 +60,7 @@ struct Running {
 
 impl Laps {
     /// Ends the stages that `name` is not within, and begins this one.
-    fn enter(&self, name: &str) -> bool {
+    pub(super) fn enter(&self, name: &str) -> bool {
         let running = &mut *self.0.borrow_mut();
         let now = Instant::now();
         let whole = name.split_once('.').map_or(name, |(whole, _)| whole);
@@ -108,14 +106,16 @@ impl Running {
 }
 
 /// What there is to print.
-struct Summary {
-    area: f64,
-    n_vertices: usize,
-    n_faces: usize,
-    eigenvalues: Vec<f64>,
-    report: CleanReport,
+pub(super) struct Summary {
+    pub(super) area: f64,
+    pub(super) n_vertices: usize,
+    pub(super) n_faces: usize,
+    pub(super) eigenvalues: Vec<f64>,
+    pub(super) report: CleanReport,
     /// Largest residual relative to its bound, and the proof of completeness; at input resolution only.
-    spectrum: Option<(f64, Certificate)>,
+    pub(super) spectrum: Option<(f64, Certificate)>,
+    /// What computing signatures amounted to; at input resolution, where they are written.
+    pub(super) signatures: Option<Signatures>,
 }
 
 pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
@@ -143,25 +143,40 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
         .num_threads(args.threads as usize)
         .build();
     let pool = pool.map_err(|e| CommandError::Failed(format!("cannot start threads: {e}")))?;
-    let (summary, arrays, laps) = pool.install(|| {
+    let (summary, laps) = pool.install(|| {
         let laps = Laps::default();
-        let (summary, arrays) = if args.full {
-            full(&bytes, format, &params, &laps, args.out.is_some())
-        } else {
-            proxy(&bytes, format, &params, &laps)
-        }
-        .map_err(|e| CommandError::Failed(format!("{path}: {e}")))?;
-        Ok::<_, CommandError>((summary, arrays, laps.finish()))
-    })?;
-    if let Some(out) = &args.out {
-        let source = |source| CommandError::File {
-            path: out.display().to_string(),
-            source,
+        let out = args.out.as_deref();
+        let summary = match args.full {
+            true => full(&bytes, format, &params, &laps, out),
+            false => proxy(&bytes, format, &params, &laps, out),
         };
-        fs::write(out, arrays).map_err(source)?;
-    }
+        let summary = summary.map_err(|e| e.of(&path))?;
+        Ok::<_, CommandError>((summary, laps.finish()))
+    })?;
     print(args, global, &summary, &laps)?;
     Ok(true)
+}
+
+/// What went wrong with a mesh, or with the file that is written.
+pub(super) enum Trouble {
+    Mesh(String),
+    Out(std::path::PathBuf, std::io::Error),
+}
+
+impl Trouble {
+    pub(super) fn mesh(error: impl std::fmt::Display) -> Self {
+        Self::Mesh(error.to_string())
+    }
+
+    fn of(self, mesh: &str) -> CommandError {
+        match self {
+            Self::Mesh(why) => CommandError::Failed(format!("{mesh}: {why}")),
+            Self::Out(path, source) => CommandError::File {
+                path: path.display().to_string(),
+                source,
+            },
+        }
+    }
 }
 
 fn proxy(
@@ -169,136 +184,29 @@ fn proxy(
     format: Format,
     params: &Params,
     laps: &Laps,
-) -> Result<(Summary, Vec<u8>), String> {
-    let d = describe(bytes, format, params, &|name| laps.enter(name)).map_err(|e| e.to_string())?;
-    laps.enter("write");
-    let arrays = write_description(&d, &params_json(params)).map_err(|e| e.to_string())?;
-    let summary = Summary {
+    out: Option<&Path>,
+) -> Result<Summary, Trouble> {
+    let described = describe(bytes, format, params, &|name| laps.enter(name));
+    let d = described.map_err(Trouble::mesh)?;
+    if let Some(out) = out {
+        laps.enter("write");
+        let params = params_json(params);
+        let array_file = DescriptionFile::new(&d, &params).map_err(Trouble::mesh)?;
+        let trouble = |e| Trouble::Out(out.to_owned(), e);
+        let mut file = fs::File::create(out).map_err(trouble)?;
+        for piece in array_file.pieces() {
+            file.write_all(piece).map_err(trouble)?;
+        }
+    }
+    Ok(Summary {
         area: d.area,
         n_vertices: d.vertices.len(),
         n_faces: d.faces.len(),
         eigenvalues: d.eigenvalues,
         report: d.report,
         spectrum: None,
-    };
-    Ok((summary, arrays))
-}
-
-/// The spectrum at input resolution, with everything in double precision.
-fn full(
-    bytes: &[u8],
-    format: Format,
-    params: &Params,
-    laps: &Laps,
-    write: bool,
-) -> Result<(Summary, Vec<u8>), String> {
-    let text = |e: &dyn std::fmt::Display| e.to_string();
-    laps.enter("parse");
-    let parsed = mesh::parse(bytes, format).map_err(|e| text(&e))?;
-    laps.enter("clean");
-    let cleaned = mesh::clean(&parsed).map_err(|e| text(&e))?;
-    let bridges = mesh::bridges(&cleaned.mesh);
-    let stage = |name: &str| laps.enter(name);
-    let found = spectrum_of(&cleaned.mesh, &bridges, params, &stage)
-        .map_err(|e: DescribeError| e.to_string())?;
-    let values = &found.spectrum.eigenvalues;
-    let arrays = if write {
-        laps.enter("hks");
-        let hks = hks(
-            values,
-            &found.spectrum.eigenvectors,
-            &hks_times(values, N_HKS_TIMES),
-        );
-        laps.enter("write");
-        let vectors = found.spectrum.eigenvectors.transpose();
-        let hks: Vec<f64> = hks.into_iter().map(f64::from).collect();
-        full_arrays(
-            &cleaned.mesh,
-            &cleaned.face_of_polygon,
-            &found.operator,
-            values,
-            vectors.as_slice(),
-            &hks,
-        )?
-    } else {
-        Vec::new()
-    };
-    let least = values.iter().copied().find(|v| *v > 0.0).unwrap_or(1.0);
-    let relative = found
-        .spectrum
-        .residuals
-        .iter()
-        .zip(values)
-        .map(|(r, v)| r / v.max(least));
-    let summary = Summary {
-        area: cleaned.area,
-        n_vertices: cleaned.mesh.vertices.len(),
-        n_faces: cleaned.mesh.faces.len(),
-        spectrum: Some((relative.fold(0.0, f64::max), found.spectrum.certificate)),
-        eigenvalues: found.spectrum.eigenvalues,
-        report: cleaned.report,
-    };
-    Ok((summary, arrays))
-}
-
-fn full_arrays(
-    mesh: &TriMesh,
-    face_map: &[u32],
-    operator: &Laplacian,
-    eigenvalues: &[f64],
-    eigenvectors: &[f64],
-    hks: &[f64],
-) -> Result<Vec<u8>, String> {
-    let (n, k) = (operator.mass.len(), eigenvalues.len());
-    let matrix = &operator.stiffness;
-    let indptr: Vec<u32> = matrix.proper_indptr().iter().map(|&i| i as u32).collect();
-    let indices: Vec<u32> = matrix.indices().iter().map(|&i| i as u32).collect();
-    let nnz = indices.len();
-    let doubles = |x: &[f64]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-    let words = |x: &[u32]| x.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-    let arrays = [
-        (
-            "vertices",
-            Dtype::F64,
-            vec![n, 3],
-            doubles(mesh.vertices.as_flattened()),
-        ),
-        (
-            "faces",
-            Dtype::U32,
-            vec![mesh.faces.len(), 3],
-            words(mesh.faces.as_flattened()),
-        ),
-        ("stiffness_indptr", Dtype::U32, vec![n + 1], words(&indptr)),
-        ("stiffness_indices", Dtype::U32, vec![nnz], words(&indices)),
-        (
-            "stiffness_data",
-            Dtype::F64,
-            vec![nnz],
-            doubles(matrix.data()),
-        ),
-        ("mass", Dtype::F64, vec![n], doubles(&operator.mass)),
-        ("eigenvalues", Dtype::F64, vec![k], doubles(eigenvalues)),
-        (
-            "eigenvectors",
-            Dtype::F64,
-            vec![n, k],
-            doubles(eigenvectors),
-        ),
-        ("hks", Dtype::F64, vec![n, N_HKS_TIMES], doubles(hks)),
-        (
-            "face_map",
-            Dtype::U32,
-            vec![face_map.len()],
-            words(face_map),
-        ),
-    ];
-    let mut views = Vec::new();
-    for (name, dtype, shape, bytes) in &arrays {
-        let view = TensorView::new(*dtype, shape.clone(), bytes).map_err(|e| e.to_string())?;
-        views.push((*name, view));
-    }
-    serialize(views, None::<HashMap<String, String>>).map_err(|e| e.to_string())
+        signatures: None,
+    })
 }
 
 fn params_json(params: &Params) -> String {
@@ -340,7 +248,12 @@ fn print(
                 "count": certificate.count,
                 "margin": certificate.margin,
                 "perturbation": certificate.perturbation,
+                "proved": certificate.proved(),
+                "growth": certificate.growth,
                 "n_components": certificate.n_components,
+                "n_krylov": certificate.n_krylov,
+                "n_polish": certificate.n_polish,
+                "n_repair": certificate.n_repair,
             });
         }
         return print_line(&value.to_string());
@@ -354,10 +267,40 @@ fn print(
         summary.area,
         summary.eigenvalues.len(),
     ))?;
+    if let Some((_, certificate)) = &summary.spectrum {
+        print_line(&proof(certificate))?;
+    }
     if args.timings {
         for (name, ms) in laps {
-            print_line(&format!("{name:>20} {ms:10.2} ms"))?;
+            let rates = match &summary.signatures {
+                Some(signatures) if name == "signatures" => signatures.rates(*ms),
+                _ => String::new(),
+            };
+            print_line(&format!("{name:>20} {ms:10.2} ms{rates}"))?;
         }
     }
     Ok(())
+}
+
+/// What is known of completeness, in words.
+fn proof(certificate: &Certificate) -> String {
+    let Certificate {
+        tau,
+        count,
+        margin,
+        perturbation,
+        ..
+    } = certificate;
+    if tau.is_infinite() {
+        return format!("complete: all {count} eigenvalues");
+    }
+    let counted = format!("{count} eigenvalues below {tau:.6} by inertia, and as many found");
+    match certificate.proved() {
+        true => format!(
+            "complete, proved: {counted}; rounding moves them by {perturbation:.1e} at most, the margin is {margin:.1e}"
+        ),
+        false => format!(
+            "complete, counted but not proved: {counted}; in the worst case rounding moves them by {perturbation:.1e}, more than the margin of {margin:.1e}"
+        ),
+    }
 }

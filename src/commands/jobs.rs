@@ -53,6 +53,17 @@ pub(crate) fn jobs(args: &Jobs, mut session: Session) -> Outcome {
             let n = job.items.iter().filter(|i| states.contains(&i.state()));
             n.count().to_string()
         };
+        if let Some(carrying) = job.carrying {
+            rows.push(vec![
+                job.job_id.to_string(),
+                format!("{} (a correction)", job.collection),
+                carrying.n_shapes.to_string(),
+                (carrying.n_shapes - carrying.n_left).to_string(),
+                String::new(),
+                carrying.n_left.to_string(),
+            ]);
+            continue;
+        }
         rows.push(vec![
             job.job_id.to_string(),
             job.collection.clone(),
@@ -123,5 +134,6 @@ fn to_json(job: &wire::Job) -> Value {
         "collection": job.collection,
         "finished": job.finished,
         "shapes": items.collect::<Vec<_>>(),
+        "carrying": job.carrying.map(|c| json!({ "n_shapes": c.n_shapes, "n_left": c.n_left })),
     })
 }

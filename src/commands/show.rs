@@ -39,8 +39,15 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     let spec = c.spec.clone().unwrap_or_default();
     let n_parts = spec.n_parts.filter(|&n| n > 0);
     let parts = n_parts.map_or_else(|| "estimated".to_owned(), |n| n.to_string());
+    let sure = c.up_estimate.map_or_else(String::new, |e| {
+        let percent = 100.0 * e.agreement;
+        format!(
+            " ({}, {percent:.0} % of the shapes agree)",
+            json::up(e.up())
+        )
+    });
     session.line(&format!(
-        "{}: {} shapes ({} stale), parts {parts}, up {}, sequence {}",
+        "{}: {} shapes ({} stale), parts {parts}, up {}{sure}, sequence {}",
         spec.name,
         c.n_shapes,
         c.n_stale,

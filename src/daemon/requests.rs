@@ -278,6 +278,9 @@ impl Daemon {
             .iter()
             .filter(|i| convert::job_finished(&i.state))
             .count();
+        if let Some(carrying) = job.carrying {
+            return convert::carrying_job(job, &carrying);
+        }
         wire::Job {
             job_id: job.id,
             collection: job.collection.clone(),
@@ -286,6 +289,7 @@ impl Daemon {
             // A finished job changes no more.
             revision: progress.revision(job.id).unwrap_or(u64::MAX),
             items,
+            carrying: None,
         }
     }
 }
@@ -373,7 +377,14 @@ async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Ans
     let mut drain = daemon.drain.subscribe();
     loop {
         let revision = daemon.work.progress().revision(request.job_id);
-        let Some(revision) = revision else { break };
+        let revision = match revision {
+            Some(revision) => revision,
+            // Over, or a correction that is carried, which only the catalog knows.
+            None => match read_job(daemon, request.job_id).await? {
+                job if job.finished => break,
+                job => job.revision,
+            },
+        };
         if revision != request.revision && begin.elapsed() >= WATCH_PACE {
             break;
         }

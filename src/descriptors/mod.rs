@@ -18,10 +18,11 @@ pub use local_pca::local_pca;
 pub use position::{position, up_columns};
 pub use shape_diameter::shape_diameter;
 pub use signature::{N_SHAPE_DNA, signature};
-pub use spectral::{gps, hks, hks_times, null_space, shape_dna, wave_weights, wks};
+pub use spectral::{
+    PointKernels, gps, gps_scales, hks, hks_times, null_space, shape_dna, wave_weights, wks,
+};
 
 use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh};
-use nalgebra::DMatrix;
 
 /// Names and widths of the groups of face descriptors, in column order.
 ///
@@ -70,8 +71,15 @@ pub struct FaceDescriptors {
     pub farthest_start: u32,
 }
 
-/// Face descriptors of a proxy mesh of area 1 with its bridges, dual graph and spectrum (`eigenvalues`
-/// `(k,)` ascending, `eigenvectors (n, k)` mass-orthonormal), the columns of all [`GROUPS`].
+/// The kernels that [`face_descriptors`] takes, for the `eigenvalues` of a proxy; as many columns of
+/// eigenvectors count as it takes pairs of.
+pub fn face_kernels(eigenvalues: &[f64]) -> PointKernels {
+    let k = eigenvalues.len().min(MAX_EIGENPAIRS);
+    spectral::relative_kernels(&eigenvalues[..k], N_HEAT_TIMES, N_WAVE_ENERGIES)
+}
+
+/// Face descriptors of a proxy mesh of area 1 with its bridges, dual graph and the heat and wave `kernels`
+/// of its vertices (see [`face_kernels`]), the columns of all [`GROUPS`].
 ///
 /// Independent of rotation, reflection, translation and numbering up to rounding, with these
 /// exceptions: where principal axes are not unique (a sphere) `pos` depends on the coordinates, and the
@@ -81,8 +89,7 @@ pub fn face_descriptors(
     mesh: &TriMesh,
     bridges: &[Bridge],
     dual: &DualGraph,
-    eigenvalues: &[f64],
-    eigenvectors: &DMatrix<f64>,
+    kernels: &[f64],
 ) -> FaceDescriptors {
     let m = mesh.faces.len();
     let n = GROUPS.iter().map(|g| g.1).sum();
@@ -127,18 +134,8 @@ pub fn face_descriptors(
     columns.push_all(local_pca::N_COLUMNS, &local_pca(&geometry));
     columns.push_all(position::N_COLUMNS, &position(&geometry));
 
-    let k = eigenvalues
-        .len()
-        .min(eigenvectors.ncols())
-        .min(MAX_EIGENPAIRS);
-    let kernels = spectral::kernels(
-        &eigenvalues[..k],
-        eigenvectors,
-        N_HEAT_TIMES,
-        N_WAVE_ENERGIES,
-    );
     let width = N_HEAT_TIMES + N_WAVE_ENERGIES;
-    let mut kernels = to_faces(mesh, &kernels, width);
+    let mut kernels = to_faces(mesh, kernels, width);
     for x in &mut kernels {
         *x = x.max(MIN_KERNEL).ln();
     }

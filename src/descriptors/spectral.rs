@@ -7,6 +7,7 @@
 //! Peinecke 2006, *Laplace-Beltrami Spectra as Shape-DNA*. Sums of squares of eigenvectors depend
 //! neither on their signs nor on the basis of an eigenspace.
 
+use crate::linalg::squares::SquareWeights;
 use nalgebra::DMatrix;
 
 /// Eigenvalues up to this fraction of the largest one given are zero: solvers leave about 1e-10.
@@ -16,6 +17,8 @@ const ZERO: f64 = 1e-7;
 const MIN_EIGENVALUE: f64 = 1e-3;
 /// Width of the wave kernel's energy bands, in percent of the range of energies, from the paper.
 const WAVE_WIDTH: f64 = 0.07;
+/// Points whose rows of eigenvectors are worked on together: few enough to stay in the cache.
+const BATCH: usize = 48;
 
 /// Number of eigenvalues (ascending) that are zero: one for each component of the domain.
 pub fn null_space(eigenvalues: &[f64]) -> usize {
@@ -45,12 +48,81 @@ fn ends(eigenvalues: &[f64]) -> Option<(f64, f64)> {
     eigenvalues.last().map(|&last| (first, last))
 }
 
+/// The heat and wave kernel signatures of points from their rows of eigenvectors: one pass over the squares,
+/// one matrix product with the exponentials.
+#[derive(Debug)]
+pub struct PointKernels {
+    weights: SquareWeights,
+    n_times: usize,
+}
+
+impl PointKernels {
+    /// For the heat kernel at `times` and the wave kernel at `n_energies` energies, uniform in log λ
+    /// from the first of the `eigenvalues` `(k,)` above the null space to the last. O(k (times + energies)).
+    pub fn new(eigenvalues: &[f64], times: &[f64], n_energies: usize) -> Self {
+        let wave = wave_weights(eigenvalues, n_energies);
+        let n_times = times.len();
+        let weight = |i: usize, j: usize| match times.get(j) {
+            Some(t) => (-eigenvalues[i] * t).exp(),
+            None => wave[(i, j - n_times)],
+        };
+        Self {
+            weights: SquareWeights::new(eigenvalues.len(), n_times + n_energies, weight),
+            n_times,
+        }
+    }
+
+    /// Times and energies.
+    pub fn n_columns(&self) -> usize {
+        self.weights.n_out()
+    }
+
+    /// Times.
+    pub fn n_times(&self) -> usize {
+        self.n_times
+    }
+
+    /// Multiplications and additions for a point.
+    pub fn flops(&self) -> usize {
+        self.weights.flops()
+    }
+
+    /// For rows of eigenvectors, `width` numbers apart, of which the first k count, the kernels at all
+    /// times, then those at all energies: `(rows, n_columns)`.
+    ///
+    /// # Panics
+    /// `out` has not as many rows.
+    pub fn of_rows(&self, rows: &[f64], width: usize, out: &mut [f64]) {
+        self.weights.apply(rows, width, out);
+    }
+
+    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major.
+    pub fn of_matrix(&self, eigenvectors: &DMatrix<f64>) -> Vec<f64> {
+        let (n, k) = (eigenvectors.nrows(), self.weights.n_in());
+        let mut out = vec![0.0; n * self.n_columns()];
+        let mut rows = vec![0.0; BATCH * k];
+        for first in (0..n).step_by(BATCH) {
+            let count = BATCH.min(n - first);
+            for i in 0..k {
+                let column = &eigenvectors.as_slice()[i * n + first..][..count];
+                for (v, x) in column.iter().enumerate() {
+                    rows[v * k + i] = *x;
+                }
+            }
+            let width = self.n_columns();
+            let out = &mut out[first * width..(first + count) * width];
+            self.of_rows(&rows[..count * k], k, out);
+        }
+        out
+    }
+}
+
 /// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs there are
 /// both a value `(k,)` and a vector `(n, k)` of. Unit: 1 / area. O(n k times), as one matrix product.
 pub fn hks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, times: &[f64]) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
-    let heat = DMatrix::from_fn(k, times.len(), |i, j| (-eigenvalues[i] * times[j]).exp());
-    to_single(&weighted_squares(eigenvectors, &heat))
+    let kernels = PointKernels::new(&eigenvalues[..k], times, 0);
+    to_single(&kernels.of_matrix(eigenvectors))
 }
 
 /// Wave kernel signature `(n, n_energies)`, row-major: for energies uniform in log λ from the first
@@ -58,28 +130,33 @@ pub fn hks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, times: &[f64]) -> V
 /// energy. Zero when no eigenvalue is above the null space.
 pub fn wks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, n_energies: usize) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
-    to_single(&weighted_squares(
-        eigenvectors,
-        &wave_weights(&eigenvalues[..k], n_energies),
-    ))
+    let kernels = PointKernels::new(&eigenvalues[..k], &[], n_energies);
+    to_single(&kernels.of_matrix(eigenvectors))
 }
 
 /// Global point signature `(n, dims)`, row-major: `φ_i(x) / √λ_i` for the first `dims` eigenvalues above
 /// the null space; zero beyond the last. Signs are those of the eigenvectors.
 pub fn gps(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, dims: usize) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
+    let scales = gps_scales(&eigenvalues[..k], dims);
     let skip = null_space(&eigenvalues[..k]);
     let mut result = Vec::with_capacity(eigenvectors.nrows() * dims);
     for v in 0..eigenvectors.nrows() {
-        result.extend((skip..skip + dims).map(|i| {
-            if i < k {
-                (eigenvectors[(v, i)] / eigenvalues[i].sqrt()) as f32
-            } else {
-                0.0
-            }
+        result.extend(scales.iter().zip(skip..).map(|(scale, i)| match i < k {
+            true => (eigenvectors[(v, i)] * scale) as f32,
+            false => 0.0,
         }));
     }
     result
+}
+
+/// `1 / √λ_i` of the first `dims` eigenvalues above the null space, by which a row of eigenvectors, from
+/// there on, is scaled to its global point signature; zero beyond the last.
+pub fn gps_scales(eigenvalues: &[f64], dims: usize) -> Vec<f64> {
+    let above = &eigenvalues[null_space(eigenvalues)..];
+    (0..dims)
+        .map(|i| above.get(i).map_or(0.0, |l| 1.0 / l.sqrt()))
+        .collect()
 }
 
 /// ShapeDNA `(n,)`: logarithms of the first `n` eigenvalues above the null space, for a mesh of area 1.
@@ -91,13 +168,12 @@ pub fn shape_dna(eigenvalues: &[f64], n: usize) -> Vec<f32> {
 }
 
 /// Heat kernel signature over the heat trace at `n_times` times, then wave kernel signature at
-/// `n_energies` energies, `(n, n_times + n_energies)` row-major.
-pub(super) fn kernels(
+/// `n_energies` energies, of rows of eigenvectors as for [`PointKernels::of_rows`].
+pub(super) fn relative_kernels(
     eigenvalues: &[f64],
-    eigenvectors: &DMatrix<f64>,
     n_times: usize,
     n_energies: usize,
-) -> Vec<f64> {
+) -> PointKernels {
     let k = eigenvalues.len();
     let mut weights = DMatrix::zeros(k, n_times + n_energies);
     if let Some((second, last)) = ends(eigenvalues) {
@@ -116,8 +192,10 @@ pub(super) fn kernels(
     weights
         .columns_mut(n_times, n_energies)
         .copy_from(&wave_weights(eigenvalues, n_energies));
-    let product = weighted_squares(eigenvectors, &weights);
-    product.transpose().as_slice().to_vec()
+    PointKernels {
+        weights: SquareWeights::new(k, n_times + n_energies, |i, j| weights[(i, j)]),
+        n_times,
+    }
 }
 
 /// Weight of each eigenpair at each energy `(k, n_energies)`; columns sum to 1.
@@ -148,19 +226,14 @@ pub fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
     weights
 }
 
-/// `(φ²) weights`: `(n, k) (k, t) → (n, t)`.
-fn weighted_squares(eigenvectors: &DMatrix<f64>, weights: &DMatrix<f64>) -> DMatrix<f64> {
-    eigenvectors.columns(0, weights.nrows()).map(|x| x * x) * weights
-}
-
-/// Row-major, in single precision.
-fn to_single(values: &DMatrix<f64>) -> Vec<f32> {
-    values.transpose().iter().map(|&x| x as f32).collect()
+/// In single precision.
+fn to_single(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|&x| x as f32).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{gps, hks, hks_times, kernels, null_space, shape_dna, wks};
+    use super::{gps, hks, hks_times, null_space, relative_kernels, shape_dna, wks};
     use nalgebra::DMatrix;
 
     /// A path of four points: eigenvalues 2 − 2 cos(πi/4), eigenvectors cosines.
@@ -172,6 +245,15 @@ mod tests {
             scale * ((v as f64 + 0.5) * angle(i)).cos()
         });
         (values, vectors)
+    }
+
+    fn kernels(
+        values: &[f64],
+        vectors: &DMatrix<f64>,
+        n_times: usize,
+        n_energies: usize,
+    ) -> Vec<f64> {
+        relative_kernels(values, n_times, n_energies).of_matrix(vectors)
     }
 
     #[test]
@@ -239,7 +321,10 @@ mod tests {
         assert_eq!(null_space(&values), 1);
         let g = gps(&values, &vectors, 5);
         for v in 0..4 {
-            assert_eq!(g[5 * v + 1], (vectors[(v, 2)] / values[2].sqrt()) as f32);
+            assert_eq!(
+                g[5 * v + 1],
+                (vectors[(v, 2)] * (1.0 / values[2].sqrt())) as f32
+            );
             assert_eq!(g[5 * v + 3..5 * v + 5], [0.0, 0.0]);
         }
         let dna = shape_dna(&values, 5);

@@ -1,4 +1,6 @@
-use super::{FaceDescriptors, GROUPS, area_ranks, face_descriptors, hks, hks_times, signature};
+use super::{
+    FaceDescriptors, GROUPS, area_ranks, face_descriptors, face_kernels, hks, hks_times, signature,
+};
 use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh, bridges, clean, distance, proxy, zoo};
 use nalgebra::{DMatrix, DVector};
 
@@ -47,7 +49,8 @@ fn describe(mesh: &TriMesh, k: usize) -> FaceDescriptors {
     let joins = bridges(mesh);
     let dual = DualGraph::new(mesh, &joins);
     let (values, vectors) = spectrum(mesh, &joins, k);
-    let face = face_descriptors(mesh, &joins, &dual, &values, &vectors);
+    let kernels = face_kernels(&values).of_matrix(&vectors);
+    let face = face_descriptors(mesh, &joins, &dual, &kernels);
     assert!(
         signature(mesh, &face, &values)
             .iter()

@@ -41,6 +41,7 @@ pub fn collection(c: &wire::Collection) -> Value {
         "name": spec.name,
         "n_parts": spec.n_parts.filter(|&n| n > 0),
         "up": up(spec.up()),
+        "up_estimate": c.up_estimate.map(|e| json!({ "up": up(e.up()), "agreement": e.agreement })),
         "operator": short(spec.operator().as_str_name(), "OPERATOR_").replace('_', "-"),
         "working_faces": spec.working_faces,
         "sequence": c.sequence,

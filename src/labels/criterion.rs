@@ -10,7 +10,7 @@ use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
 use sprs::CsMat;
 
-/// Weight of the log of the concavity, in the score and in the value of a labelling.
+/// Weight of the log of the concavity in the score.
 const CONCAVITY_WEIGHT: f64 = 0.5;
 /// Share of the intra-shape graph in the joint patch graph.
 const ALPHA: f64 = 0.5;
@@ -95,12 +95,12 @@ impl Criterion {
         sums
     }
 
-    /// What the concavity of the boundaries between labels is worth: its weighted log; the concavity is their
-    /// length-weighted mean crease relative to that of all patch boundaries.
-    pub(super) fn concavity_value(&self, sums: &PairSums) -> f64 {
+    /// Log of the concavity of the boundaries between labels: their length-weighted mean crease relative to that of
+    /// all patch boundaries.
+    pub(super) fn log_concavity(&self, sums: &PairSums) -> f64 {
         let boundary = sums.between(&sums.creased) / sums.between(&sums.length).max(1e-9);
         let concavity = boundary / self.mean_crease.max(1e-300);
-        CONCAVITY_WEIGHT * concavity.max(1e-3).ln()
+        concavity.max(1e-3).ln()
     }
 
     /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
@@ -113,7 +113,7 @@ impl Criterion {
                 sums.affinity[l * k + l] / total - (volume / total).powi(2)
             })
             .sum();
-        self.concavity_value(sums) + modularity.max(1e-6).ln()
+        CONCAVITY_WEIGHT * self.log_concavity(sums) + modularity.max(1e-6).ln()
     }
 }
 

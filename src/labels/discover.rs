@@ -73,7 +73,7 @@ pub struct Discovery {
     pub labels: Vec<Vec<u32>>,
     /// Number of labels.
     pub n_labels: usize,
-    /// Its value: half the log concavity of its boundaries plus consensus with the candidates.
+    /// Its value: log concavity of its boundaries, by the number of shapes, plus consensus with the candidates.
     pub value: f64,
     /// The value of the labelling that is there, judged by the same candidates; negative infinity without one.
     pub current_value: f64,

@@ -1,25 +1,29 @@
 //! Which of many candidate labellings is best, when nothing is known but the shapes.
 //!
-//! The value of a labelling is half the log of how concave its boundaries are plus how much it agrees with the
-//! other candidates, each counting by its score. The two err in different ways: a few very concave boundaries may
-//! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs.
+//! The value of a labelling is the log of how concave its boundaries are plus how much it agrees with the other
+//! candidates, each counting by its own concavity. The two err in different ways: a few very concave boundaries may
+//! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs. On a
+//! few shapes a handful of deep creases decide on the concavity: it counts by the number of shapes, up to a full weight.
 
 use super::criterion::Criterion;
 use nalgebra::DMatrix;
 
-/// Temperature of the scores when the candidates vote.
-const TEMPERATURE: f64 = 0.1;
+/// Temperature of the log concavities when the candidates vote.
+const TEMPERATURE: f64 = 0.15;
+/// Shapes from which on the concavity has its full weight.
+const FULL_WEIGHT_SHAPES: f64 = 14.0;
 /// Weight of the consensus beside the score, when numbers of labels are compared.
 const CONSENSUS_WEIGHT: f64 = 0.5;
 
-/// Judges labellings by the criterion, and by how much they agree with what the good candidates agree on.
+/// Judges labellings by their concavity, and by how much they agree with what the good candidates agree on.
 pub(super) struct Judge<'a> {
     criterion: &'a Criterion,
-    /// Candidate labellings of all patches, their scores, and the softmax of these.
+    /// Candidate labellings of all patches, and the softmax of their log concavities.
     candidates: Vec<Vec<u32>>,
-    scores: Vec<f64>,
     weights: Vec<f64>,
+    /// Area share of each patch, summing to the number of shapes.
     area: &'a [f64],
+    concavity_weight: f64,
     k: usize,
 }
 
@@ -30,23 +34,26 @@ impl<'a> Judge<'a> {
         area: &'a [f64],
         k: usize,
     ) -> Self {
-        let scores: Vec<f64> = candidates
+        let concavities: Vec<f64> = candidates
             .iter()
-            .map(|l| criterion.score(&criterion.pair_sums(l, k)))
+            .map(|l| criterion.log_concavity(&criterion.pair_sums(l, k)))
             .collect();
-        let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let mut weights: Vec<f64> = scores
+        let top = concavities
             .iter()
-            .map(|s| ((s - top) / TEMPERATURE).exp())
+            .copied()
+            .fold(f64::NEG_INFINITY, f64::max);
+        let mut weights: Vec<f64> = concavities
+            .iter()
+            .map(|c| ((c - top) / TEMPERATURE).exp())
             .collect();
         let sum: f64 = weights.iter().sum();
         weights.iter_mut().for_each(|w| *w /= sum);
         Self {
             criterion,
             candidates,
-            scores,
             weights,
             area,
+            concavity_weight: (area.iter().sum::<f64>() / FULL_WEIGHT_SHAPES).min(1.0),
             k,
         }
     }
@@ -64,7 +71,7 @@ impl<'a> Judge<'a> {
             .zip(self.consensus(labellings, k))
             .map(|(l, c)| {
                 let sums = self.criterion.pair_sums(l, k);
-                self.criterion.concavity_value(&sums) + c
+                self.concavity_weight * self.criterion.log_concavity(&sums) + c
             })
             .collect()
     }
@@ -81,9 +88,12 @@ impl<'a> Judge<'a> {
     /// The best candidate's score plus consensus, which numbers of labels can be compared by.
     pub(super) fn comparable_value(&self) -> f64 {
         let consensus = self.consensus(&self.candidates, self.k);
-        let values = self.scores.iter().zip(consensus);
-        values
-            .map(|(s, c)| s + CONSENSUS_WEIGHT * c)
+        let candidates = self.candidates.iter().zip(consensus);
+        candidates
+            .map(|(l, c)| {
+                let sums = self.criterion.pair_sums(l, self.k);
+                self.criterion.score(&sums) + CONSENSUS_WEIGHT * c
+            })
             .fold(f64::NEG_INFINITY, f64::max)
     }
 

@@ -25,4 +25,4 @@ pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
-pub use up::estimate_up;
+pub use up::{UpVote, estimate_up};

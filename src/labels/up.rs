@@ -12,11 +12,24 @@ const UNSTABLE: f64 = 0.2;
 /// Least share of the shapes that must agree; of six axes one gets a sixth by chance.
 const LEAST_AGREEMENT: f64 = 0.5;
 
-/// The unit vector that most shapes stand along, and the share of the shapes that agree; `None` where fewer than
-/// half do.
-pub fn estimate_up<'a>(
-    shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
-) -> Option<([f64; 3], f64)> {
+/// The axis that most shapes of a collection stand along.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpVote {
+    /// A unit vector: a coordinate axis or its opposite.
+    pub axis: [f64; 3],
+    /// Share of the shapes that agree, 0 to 1.
+    pub agreement: f64,
+}
+
+impl UpVote {
+    /// The axis, unless fewer than half of the shapes agree.
+    pub fn trusted(&self) -> Option<[f64; 3]> {
+        (self.agreement >= LEAST_AGREEMENT).then_some(self.axis)
+    }
+}
+
+/// The axis that most shapes stand along, and how many agree; `None` without shapes.
+pub fn estimate_up<'a>(shapes: impl Iterator<Item = &'a DescriptionView<'a>>) -> Option<UpVote> {
     let axes: [[f64; 3]; 6] = std::array::from_fn(|i| {
         let mut axis = [0.0; 3];
         axis[i / 2] = if i % 2 == 0 { 1.0 } else { -1.0 };
@@ -39,8 +52,10 @@ pub fn estimate_up<'a>(
             .then(b.cmp(a))
     };
     let winner = (0..6).max_by(better)?;
-    let agreement = votes[winner] as f64 / n.max(1) as f64;
-    (n > 0 && agreement >= LEAST_AGREEMENT).then_some((axes[winner], agreement))
+    (n > 0).then(|| UpVote {
+        axis: axes[winner],
+        agreement: votes[winner] as f64 / n as f64,
+    })
 }
 
 /// Area of the base's convex hull over that of the whole outline, seen from above; less where the centre of mass is
@@ -155,9 +170,9 @@ mod tests {
         for axis in 0..3 {
             for sign in [1.0f32, -1.0] {
                 let shape = pyramid(axis, sign);
-                let (up, agreement) = estimate_up([shape.view()].iter()).unwrap();
-                assert_eq!(up[axis], f64::from(sign));
-                assert_eq!(agreement, 1.0);
+                let vote = estimate_up([shape.view()].iter()).unwrap();
+                assert_eq!(vote.trusted().unwrap()[axis], f64::from(sign));
+                assert_eq!(vote.agreement, 1.0);
             }
         }
     }
@@ -166,7 +181,9 @@ mod tests {
     fn shapes_that_disagree_have_no_up() {
         let shapes: Vec<Description> = (0..3).map(|axis| pyramid(axis, 1.0)).collect();
         let views: Vec<DescriptionView<'_>> = shapes.iter().map(Description::view).collect();
-        assert_eq!(estimate_up(views.iter()), None);
+        let vote = estimate_up(views.iter()).unwrap();
+        assert!((vote.agreement - 1.0 / 3.0).abs() < 1e-12);
+        assert_eq!(vote.trusted(), None);
         assert_eq!(estimate_up([].iter()), None);
     }
 }

@@ -2,10 +2,10 @@
 
 use super::commit::event;
 use super::history::Before;
-use super::rows::{damaged, operator_from_name, operator_name, to_json};
+use super::rows::{CollectionState, damaged, operator_from_name, operator_name, to_json};
 use super::{
     CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
-    RequestKey, Result, Up,
+    RequestKey, Result, Up, UpEstimate,
 };
 use crate::pipeline::Params;
 use crate::store::catalog::KIND_NAME;
@@ -188,7 +188,12 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
     let place = format!("collections {}", row.name);
     let uses = reader.label_uses(row.id)?;
     let labels = reader.labels(row.id)?.into_iter();
+    let state = CollectionState::of(&row)?;
     Ok(CollectionInfo {
+        up_estimate: state.up.map(|up| UpEstimate {
+            up: Up::along(up.vote().trusted()),
+            agreement: up.agreement,
+        }),
         sequence: row.sequence,
         n_shapes: reader.n_shapes(row.id)?,
         n_stale: reader.n_stale(row.id)?,

@@ -5,7 +5,8 @@ use super::history::{Before, from_reply};
 use super::lane::Lane;
 use super::place::Known;
 use super::relabel::{NewLabels, area_shares, cause, face_ids, moves};
-use super::rows::{Teaching, damaged, label_colour, to_json};
+use super::rows::{CarryingState, CollectionState, Teaching, damaged, label_colour, to_json};
+use super::submit::unix_secs;
 use super::{
     EventKind, FailureSubject, LabelId, Library, LibraryError, PartInfo, RequestKey, Result,
 };
@@ -59,6 +60,9 @@ pub struct Corrected {
     pub changed_share: f64,
     /// Shapes whose labels wait to be recomputed from it.
     pub n_stale: u64,
+    /// The job in which it is carried to them; 0 for what an earlier version answered.
+    #[serde(default)]
+    pub job: u64,
 }
 
 /// Labels that a person used, and whether they are all there is.
@@ -159,6 +163,15 @@ impl Library {
                 tx.put_labels(id, &labels.row, &labels.summary)?;
                 tx.mark_all_stale(collection)?;
                 tx.set_stale(id, !whole)?;
+                let n_stale = tx.n_stale(collection)?;
+                let job = tx.insert_job(&lane.row.name, unix_secs(), &[])?;
+                let state = CollectionState {
+                    carrying: Some(CarryingState {
+                        job,
+                        n_shapes: n_stale,
+                    }),
+                    ..state.clone()
+                };
                 tx.set_state(collection, to_json(&state).as_bytes())?;
                 let row = collection_row(tx, collection)?;
                 let corrected = Corrected {
@@ -167,7 +180,8 @@ impl Library {
                     n_faces: pins.iter().filter(|p| **p >= 0).count() as u64,
                     area_share: covered,
                     changed_share: moved.iter().map(|m| m.area_share).sum(),
-                    n_stale: tx.n_stale(collection)?,
+                    n_stale,
+                    job,
                 };
                 Ok(to_json(&corrected).into_bytes())
             })?;

@@ -1,7 +1,7 @@
 //! Jobs for the operator: attempts that failed, jobs that failed, and trying again.
 
-use super::rows::to_json;
-use super::{Job, JobItem, Library, LibraryError, Result};
+use super::rows::{CollectionState, to_json};
+use super::{Carrying, Job, JobItem, Library, LibraryError, Result};
 use crate::store::{ItemStatus, ObjectKind};
 use serde::{Deserialize, Serialize};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -32,6 +32,23 @@ pub struct JobFilter {
 }
 
 impl Library {
+    /// How far the correction of a job is carried. Nothing is left of it once the collection is gone, or once a later
+    /// change has taken its place.
+    pub(super) fn carrying(&self, job: u64, collection: &str) -> Result<Carrying> {
+        self.store.catalog().read(|r| -> Result<Carrying> {
+            let Some(row) = r.collection(collection)? else {
+                return Ok(Carrying::default());
+            };
+            let state = CollectionState::of(&row)?;
+            let newest = state.carrying.filter(|c| c.job == job);
+            let n_stale = r.n_stale(row.id)?;
+            Ok(newest.map_or_else(Carrying::default, |c| Carrying {
+                n_shapes: c.n_shapes,
+                n_left: n_stale.min(c.n_shapes),
+            }))
+        })
+    }
+
     /// Notes durably that the work on an item ended its process once more; how often now.
     ///
     /// # Errors
@@ -71,8 +88,14 @@ impl Library {
         found
             .into_iter()
             .map(|(items, job)| {
+                let is_carrying = items.is_empty();
                 let items = items.into_iter().filter(|i| is_listed(i.status));
                 Ok(Job {
+                    carrying: if is_carrying {
+                        Some(self.carrying(job.id, &job.collection)?)
+                    } else {
+                        None
+                    },
                     id: job.id,
                     collection: job.collection,
                     items: items.map(|i| self.item(i)).collect::<Result<_>>()?,

@@ -1,7 +1,7 @@
 //! The serial state of one collection while shapes are placed into it.
 
 use super::learnt::Learnt;
-use super::rows::{CollectionState, damaged, from_json};
+use super::rows::{CollectionState, damaged};
 use super::{Result, Up};
 use crate::neighbors::SignatureMetric;
 use crate::store::{CollectionRow, Reader, ShapeId};
@@ -31,13 +31,7 @@ impl Lane {
     /// The lane of a collection, as the catalog has it.
     pub(super) fn load(reader: &Reader<'_>, row: CollectionRow) -> Result<Self> {
         let place = format!("collections {}", row.name);
-        let state = if row.state.is_empty() {
-            CollectionState::default()
-        } else {
-            let text =
-                std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
-            from_json(text, &place)?
-        };
+        let state = CollectionState::of(&row)?;
         let learnt = match reader.model(row.id)? {
             Some(bytes) => Some(Learnt::decode(&bytes).map_err(|e| damaged(&place, &e))?),
             None => None,

@@ -62,9 +62,9 @@ pub use repair::Repaired;
 pub use rows::report_to_json;
 pub use suggest::Suggestion;
 pub use types::{
-    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,
-    JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
-    PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up,
+    Carrying, CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState,
+    Job, JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
+    PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up, UpEstimate,
 };
 
 use crate::pipeline::Description;

@@ -4,10 +4,10 @@ use super::commit::Commit;
 use super::lane::{KnownShape, Lane};
 use super::learnt::Learnt;
 use super::relabel::face_ids;
-use super::rows::{CollectionState, damaged};
-use super::{Described, Library, Outcome, Placed, Result, Source, Up};
+use super::rows::{CollectionState, UpState, damaged};
+use super::{Described, Library, Outcome, Placed, Result, Source};
 use crate::fmap::{FunctionalMap, MapOptions};
-use crate::labels::{DiscoveryOptions, estimate_up};
+use crate::labels::DiscoveryOptions;
 use crate::pipeline::{
     DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote,
     label, map, recluster, unlikeness,
@@ -245,15 +245,13 @@ impl Library {
             labels: &new_ids,
         });
         let n_labels = lane.row.n_parts.map(|n| n as usize);
+        let (up_state, up) = UpState::of(lane.up(), shapes.iter().map(|s| &s.shape));
         let options = ReclusterOptions {
             discovery: DiscoveryOptions {
                 n_labels,
                 ..DiscoveryOptions::default()
             },
-            up: match lane.up() {
-                Up::Auto => estimate_up(shapes.iter().map(|s| &s.shape)).map(|found| found.0),
-                given => given.axis(),
-            },
+            up,
             always: shapes.len() <= TOO_FEW,
             next_label: lane.row.next_label,
         };
@@ -283,6 +281,7 @@ impl Library {
             next_recluster,
             representatives: ordinals.collect(),
             epoch_ordinal: lane.row.next_ordinal,
+            up: up_state,
             ..CollectionState::default()
         };
         Ok(Plan {

@@ -1,10 +1,12 @@
 //! What the catalog keeps as text becomes domain values and back.
 
-use super::{LibraryError, Result};
+use super::{LibraryError, Result, Up};
+use crate::description::DescriptionView;
 use crate::fmap::{Confidence, Quality, confidence};
+use crate::labels::{UpVote, estimate_up};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
-use crate::store::{MapRow, StoreError};
+use crate::store::{CollectionRow, MapRow, StoreError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -23,6 +25,68 @@ pub(super) struct CollectionState {
     /// From the first correction on: what labels are carried from, in the place of discovery.
     #[serde(default)]
     pub(super) teaching: Option<Teaching>,
+    /// Where the up axis is estimated: what the shapes that the model was made of say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) up: Option<UpState>,
+    /// The newest job that carries a correction.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) carrying: Option<CarryingState>,
+}
+
+impl CollectionState {
+    /// The state of a collection, as its row has it; as it begins, where there is none yet.
+    pub(super) fn of(row: &CollectionRow) -> Result<Self> {
+        let place = format!("collections {}", row.name);
+        if row.state.is_empty() {
+            return Ok(Self::default());
+        }
+        let text = std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
+        from_json(text, &place)
+    }
+}
+
+/// The job in which a person's labels are carried to the other shapes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct CarryingState {
+    /// Its id.
+    pub(super) job: u64,
+    /// Shapes that were stale when it began.
+    pub(super) n_shapes: u64,
+}
+
+/// An estimated up axis.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct UpState {
+    /// The axis, whether it is used or not.
+    pub(super) axis: [f64; 3],
+    /// Share of the shapes that agree.
+    pub(super) agreement: f64,
+}
+
+impl UpState {
+    /// What shapes say, and the axis that follows from it or from what is given.
+    pub(super) fn of<'a>(
+        given: Up,
+        shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
+    ) -> (Option<Self>, Option<[f64; 3]>) {
+        if given != Up::Auto {
+            return (None, given.axis());
+        }
+        let vote = estimate_up(shapes);
+        let said = vote.map(|v| Self {
+            axis: v.axis,
+            agreement: v.agreement,
+        });
+        (said, vote.and_then(|v| v.trusted()))
+    }
+
+    /// As a vote.
+    pub(super) fn vote(&self) -> UpVote {
+        UpVote {
+            axis: self.axis,
+            agreement: self.agreement,
+        }
+    }
 }
 
 /// How the labels of a collection follow from what a person said.

@@ -78,6 +78,11 @@ impl Library {
             })?;
             Ok((job, r.job_items(id)?))
         })?;
+        let carrying = if items.is_empty() {
+            Some(self.carrying(id, &job.collection)?)
+        } else {
+            None
+        };
         let items = items
             .into_iter()
             .map(|i| self.item(i))
@@ -86,6 +91,7 @@ impl Library {
             id,
             collection: job.collection,
             items,
+            carrying,
         })
     }
 
@@ -405,7 +411,7 @@ impl Library {
     }
 }
 
-fn unix_secs() -> u64 {
+pub(super) fn unix_secs() -> u64 {
     SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0, |d| d.as_secs())

@@ -9,10 +9,10 @@ use super::lane::Lane;
 use super::learnt::Learnt;
 use super::place::{Known, MAX_MAPS, MAX_REPRESENTATIVES};
 use super::relabel::Relabelled;
-use super::rows::{Teaching, damaged, to_json};
-use super::{LabelId, Library, Result, Up};
+use super::rows::{Teaching, UpState, damaged, to_json};
+use super::{LabelId, Library, Result};
 use crate::fmap::FunctionalMap;
-use crate::labels::{Features, LabelModel, Normalisation, Statistics, estimate_up};
+use crate::labels::{Features, LabelModel, Normalisation, Statistics};
 use crate::pipeline::{DescriptionView, Given, Lesson, LessonMap, Prepared, TeachOptions, teach};
 use crate::segmentation::Surface;
 use crate::store::Tx;
@@ -75,10 +75,7 @@ impl Library {
             .map(|at| self.known(lane.shapes[*at].id))
             .collect::<Result<_>>()?;
         let views: Vec<DescriptionView<'_>> = known.iter().map(|k| k.mapped.view()).collect();
-        let up = match lane.up() {
-            Up::Auto => estimate_up(views.iter()).map(|found| found.0),
-            given => given.axis(),
-        };
+        let (up_state, up) = UpState::of(lane.up(), views.iter());
         let parts: Vec<(Features, Surface)> = views
             .par_iter()
             .map(|v| (Features::raw(v, up), Surface::new(&v.mesh())))
@@ -95,6 +92,7 @@ impl Library {
         };
         let learnt = Learnt::begin(model);
         let mut state = lane.state.clone();
+        state.up = up_state;
         if let Some(teaching) = &mut state.teaching {
             teaching.normalised = true;
         }

@@ -45,6 +45,13 @@ impl Up {
         axis[at / 2] = if at.is_multiple_of(2) { 1.0 } else { -1.0 };
         Some(axis)
     }
+
+    /// The name of a unit vector along an axis; unknown for none.
+    pub fn along(axis: Option<[f64; 3]>) -> Self {
+        let given = Self::NAMES.iter().map(|n| n.0).take(6);
+        axis.and_then(|a| given.clone().find(|up| up.axis() == Some(a)))
+            .unwrap_or_default()
+    }
 }
 
 impl std::fmt::Display for Up {
@@ -97,6 +104,17 @@ pub struct CollectionInfo {
     pub n_stale: u64,
     /// Its labels, retired ones included.
     pub labels: Vec<LabelInfo>,
+    /// Where the up axis is estimated, and there are shapes to estimate it from: the estimate in force.
+    pub up_estimate: Option<UpEstimate>,
+}
+
+/// An estimate of which way is up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpEstimate {
+    /// A coordinate axis; unknown, if fewer than half of the shapes agree on one: then none is used.
+    pub up: Up,
+    /// Share of the shapes that stand best along the axis that most do, 0 to 1; by chance a sixth.
+    pub agreement: f64,
 }
 
 /// A label of a collection.
@@ -253,15 +271,33 @@ pub struct JobItem {
     pub attempts: u32,
 }
 
-/// Shapes that were accepted together.
+/// Shapes that were accepted together, or a correction that is carried to the other shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     /// Its id.
     pub id: u64,
     /// Which collection.
     pub collection: String,
-    /// Its shapes in order.
+    /// Its shapes in order; none where a correction is carried.
     pub items: Vec<JobItem>,
+    /// Where a correction is carried: how far that is.
+    pub carrying: Option<Carrying>,
+}
+
+/// How far a correction is carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Carrying {
+    /// Shapes to which it is carried; 0 once a later change has taken its place.
+    pub n_shapes: u64,
+    /// Those that wait for it.
+    pub n_left: u64,
+}
+
+impl Carrying {
+    /// Share that is done, 0 to 1.
+    pub fn progress(&self) -> f64 {
+        1.0 - self.n_left as f64 / self.n_shapes.max(1) as f64
+    }
 }
 
 /// What became of an added shape.

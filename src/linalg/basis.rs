@@ -11,8 +11,8 @@ use super::panel::{
 };
 use memmap2::MmapMut;
 use pulp::Arch;
-use rayon::prelude::{IntoParallelIterator, ParallelIterator};
-use rayon::slice::ParallelSliceMut;
+use rayon::prelude::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator};
+use rayon::slice::{ParallelSlice, ParallelSliceMut};
 
 /// Chunks whose panels stay in the second-level cache while they are combined anew.
 const BATCH: usize = 16;
@@ -80,9 +80,15 @@ impl Basis {
             self.grow();
         }
         let (begin, stride) = (self.n_panels * CHUNK, self.capacity * CHUNK);
-        let chunks = self.rows_mut().chunks_exact_mut(stride);
-        for (chunk, rows) in chunks.zip(panel.chunks_exact(CHUNK)) {
+        let put = |(chunk, rows): (&mut [Row], &[Row])| {
             chunk[begin..begin + CHUNK].copy_from_slice(rows);
+        };
+        if self.parallel {
+            let chunks = self.rows_mut().par_chunks_exact_mut(stride);
+            chunks.zip(panel.par_chunks_exact(CHUNK)).for_each(put);
+        } else {
+            let chunks = self.rows_mut().chunks_exact_mut(stride);
+            chunks.zip(panel.chunks_exact(CHUNK)).for_each(put);
         }
         self.n_panels += 1;
     }
@@ -113,6 +119,12 @@ impl Basis {
     pub fn copy_panel(&self, j: usize, out: &mut Vec<Row>) {
         out.clear();
         self.rows_of(j).for_each(|rows| out.extend_from_slice(rows));
+    }
+
+    /// Row `i` of every panel.
+    pub fn row(&self, i: usize) -> impl Iterator<Item = &Row> {
+        let chunk = self.chunk(i / CHUNK);
+        chunk[(i % CHUNK).min(chunk.len())..].iter().step_by(CHUNK)
     }
 
     /// The rows of panel `j`, chunk by chunk.

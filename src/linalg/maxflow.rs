@@ -1,132 +1,327 @@
-//! Minimum cuts of sparse graphs by Dinic's algorithm, with integer capacities (exact and deterministic).
+//! Minimum cuts of sparse graphs by two search trees that are kept from path to path (Boykov and Kolmogorov
+//! 2004, *An Experimental Comparison of Min-Cut/Max-Flow Algorithms*), with integer capacities: exact and
+//! deterministic. On the bands and surfaces that are cut here that is many times quicker than shortest paths.
 
 use std::collections::VecDeque;
 
 /// A flow network over `n` nodes with a source and a sink of its own.
 #[derive(Debug, Clone)]
 pub struct Network {
-    /// Residual capacity of each arc; arc `2e` and `2e + 1` are each other's reverse.
-    residual: Vec<i64>,
-    head: Vec<u32>,
-    first: Vec<u32>,
-    next: Vec<u32>,
-    n: usize,
+    /// Tail, head, capacity there and back.
+    edges: Vec<(u32, u32, i64, i64)>,
+    /// What the source can still send to each node; below zero, what the node can still send to the sink.
+    terminal: Vec<i64>,
 }
 
-const NONE: u32 = u32::MAX;
+/// No arc: the node is in neither tree.
+const FREE: u32 = u32::MAX;
+/// The node hangs on the source or the sink itself.
+const ROOT: u32 = u32::MAX - 1;
+/// The node has lost its arc to the root and looks for another.
+const ORPHAN: u32 = u32::MAX - 2;
 
 impl Network {
     /// A network of `n` nodes and no arcs.
     pub fn new(n: usize) -> Self {
         Self {
-            residual: Vec::new(),
-            head: Vec::new(),
-            first: vec![NONE; n + 2],
-            next: Vec::new(),
-            n,
-        }
-    }
-
-    fn source(&self) -> usize {
-        self.n
-    }
-
-    fn sink(&self) -> usize {
-        self.n + 1
-    }
-
-    fn add(&mut self, from: usize, to: usize, forward: i64, backward: i64) {
-        assert!(forward >= 0 && backward >= 0, "capacities are not negative");
-        for (a, b, c) in [(from, to, forward), (to, from, backward)] {
-            self.next.push(self.first[a]);
-            self.first[a] = self.head.len() as u32;
-            self.head.push(b as u32);
-            self.residual.push(c);
+            edges: Vec::new(),
+            terminal: vec![0; n],
         }
     }
 
     /// Arcs `from → to` and `to → from` with the given capacities.
     pub fn edge(&mut self, from: usize, to: usize, forward: i64, backward: i64) {
-        if forward > 0 || backward > 0 {
-            self.add(from, to, forward, backward);
+        assert!(forward >= 0 && backward >= 0, "capacities are not negative");
+        if from != to && (forward > 0 || backward > 0) {
+            self.edges.push((from as u32, to as u32, forward, backward));
         }
     }
 
     /// The cost of `node` being on the sink side and on the source side of the cut.
     pub fn terminal(&mut self, node: usize, on_sink_side: i64, on_source_side: i64) {
-        let common = on_sink_side.min(on_source_side);
-        let (s, t) = (self.source(), self.sink());
-        if on_sink_side > common {
-            self.add(s, node, on_sink_side - common, 0);
-        } else if on_source_side > common {
-            self.add(node, t, on_source_side - common, 0);
-        }
+        self.terminal[node] += on_sink_side - on_source_side;
     }
 
     /// Maximises the flow and returns, for each node, whether it is on the sink side of the minimum
     /// cut that has the fewest nodes on the source side.
-    pub fn sink_side(mut self) -> Vec<bool> {
-        let (s, t) = (self.source(), self.sink());
-        let mut level = vec![NONE; self.n + 2];
-        while self.levels(&mut level) {
-            self.block(s, t, &level);
+    pub fn sink_side(self) -> Vec<bool> {
+        let mut search = Search::new(&self);
+        search.run();
+        let in_source_tree = |node: &Node| node.parent != FREE && !node.sink;
+        search.nodes.iter().map(|v| !in_source_tree(v)).collect()
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Arc {
+    head: u32,
+    /// The arc back.
+    back: u32,
+    residual: i64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Node {
+    /// The arc to the parent in its tree, or one of the three words above.
+    parent: u32,
+    /// When its distance was last known to be right, and what it was, in arcs from the root.
+    seen: u32,
+    distance: u32,
+    /// Which tree it is in, if in one.
+    sink: bool,
+    /// Whether it waits in `active`.
+    waits: bool,
+}
+
+/// Trees grow from both ends until they touch; what a path saturates is cut off, and what hung on it is taken in
+/// elsewhere or set free.
+struct Search {
+    nodes: Vec<Node>,
+    /// Arcs of each node, in the order in which edges were added; where each node's begin.
+    arcs: Vec<Arc>,
+    first: Vec<u32>,
+    terminal: Vec<i64>,
+    active: VecDeque<u32>,
+    orphans: VecDeque<u32>,
+    /// Orphans of the last path, nearest to the roots first.
+    cut_off: VecDeque<u32>,
+    now: u32,
+}
+
+impl Search {
+    fn new(network: &Network) -> Self {
+        let n = network.terminal.len();
+        let mut first = vec![0_u32; n + 1];
+        for &(a, b, ..) in &network.edges {
+            first[a as usize + 1] += 1;
+            first[b as usize + 1] += 1;
         }
-        (0..self.n).map(|v| level[v] == NONE).collect()
+        for v in 0..n {
+            first[v + 1] += first[v];
+        }
+        let mut next = first.clone();
+        let nothing = Arc {
+            head: 0,
+            back: 0,
+            residual: 0,
+        };
+        let mut arcs = vec![nothing; 2 * network.edges.len()];
+        for &(a, b, forward, backward) in &network.edges {
+            let (there, back) = (next[a as usize], next[b as usize]);
+            next[a as usize] += 1;
+            next[b as usize] += 1;
+            arcs[there as usize] = Arc {
+                head: b,
+                back,
+                residual: forward,
+            };
+            arcs[back as usize] = Arc {
+                head: a,
+                back: there,
+                residual: backward,
+            };
+        }
+        let node = |&terminal: &i64| Node {
+            parent: if terminal == 0 { FREE } else { ROOT },
+            seen: 0,
+            distance: 1,
+            sink: terminal < 0,
+            waits: terminal != 0,
+        };
+        let nodes: Vec<Node> = network.terminal.iter().map(node).collect();
+        let active = (0..n as u32).filter(|v| nodes[*v as usize].waits).collect();
+        Self {
+            nodes,
+            arcs,
+            first,
+            terminal: network.terminal.clone(),
+            active,
+            orphans: VecDeque::new(),
+            cut_off: VecDeque::new(),
+            now: 0,
+        }
     }
 
-    /// Breadth-first levels from the source over residual arcs; whether the sink is reached.
-    fn levels(&self, level: &mut [u32]) -> bool {
-        level.fill(NONE);
-        level[self.source()] = 0;
-        let mut queue = VecDeque::from([self.source()]);
-        while let Some(v) = queue.pop_front() {
-            let mut a = self.first[v];
-            while a != NONE {
-                let (w, c) = (self.head[a as usize] as usize, self.residual[a as usize]);
-                if c > 0 && level[w] == NONE {
-                    level[w] = level[v] + 1;
-                    queue.push_back(w);
-                }
-                a = self.next[a as usize];
-            }
-        }
-        level[self.sink()] != NONE
+    fn arcs_of(&self, v: u32) -> std::ops::Range<usize> {
+        self.first[v as usize] as usize..self.first[v as usize + 1] as usize
     }
 
-    /// Sends flow along paths of the level graph until none is left, without recursion. After a path is
-    /// used, the search goes on from where it first became full.
-    fn block(&mut self, s: usize, t: usize, level: &[u32]) {
-        let mut arc = self.first.clone();
-        let mut path: Vec<u32> = Vec::new();
-        let mut v = s;
-        loop {
-            if v == t {
-                let residual = &self.residual;
-                let flow = path.iter().map(|a| residual[*a as usize]).min();
-                let flow = flow.expect("invariant: source and sink differ");
-                for &a in &path {
-                    self.residual[a as usize] -= flow;
-                    self.residual[a as usize ^ 1] += flow;
+    /// Capacity left along an arc away from the root of the tree of the arc's tail.
+    fn away(&self, arc: usize, sink: bool) -> i64 {
+        let arc = &self.arcs[arc];
+        if sink {
+            self.arcs[arc.back as usize].residual
+        } else {
+            arc.residual
+        }
+    }
+
+    fn activate(&mut self, v: u32) {
+        if !std::mem::replace(&mut self.nodes[v as usize].waits, true) {
+            self.active.push_back(v);
+        }
+    }
+
+    fn run(&mut self) {
+        while let Some(v) = self.active.pop_front() {
+            self.nodes[v as usize].waits = false;
+            // The same node grows on as long as it is in a tree and touches the other one.
+            while self.nodes[v as usize].parent != FREE {
+                let Some(bridge) = self.grow(v) else { break };
+                self.now += 1;
+                self.augment(bridge);
+                while let Some(orphan) = self.cut_off.pop_front() {
+                    self.orphans.push_back(orphan);
+                    while let Some(orphan) = self.orphans.pop_front() {
+                        self.adopt(orphan);
+                    }
                 }
-                let full = path.iter().position(|a| self.residual[*a as usize] == 0);
-                let full = full.expect("invariant: the least residual is used up");
-                v = self.head[path[full] as usize ^ 1] as usize;
-                path.truncate(full);
+            }
+        }
+    }
+
+    /// Takes in the free neighbours of a node; an arc from the source's tree to the sink's, if there is one.
+    fn grow(&mut self, v: u32) -> Option<usize> {
+        let me = self.nodes[v as usize];
+        for a in self.arcs_of(v) {
+            if self.away(a, me.sink) == 0 {
                 continue;
             }
-            let a = arc[v];
-            if a == NONE {
-                let Some(back) = path.pop() else { return };
-                v = self.head[back as usize ^ 1] as usize;
-                arc[v] = self.next[arc[v] as usize];
+            let (w, back) = (self.arcs[a].head, self.arcs[a].back);
+            let other = &mut self.nodes[w as usize];
+            let closer = other.seen <= me.seen && other.distance > me.distance;
+            if other.parent == FREE || (other.sink == me.sink && closer) {
+                let was_free = other.parent == FREE;
+                other.sink = me.sink;
+                other.parent = back;
+                other.seen = me.seen;
+                other.distance = me.distance + 1;
+                if was_free {
+                    self.activate(w);
+                }
+            } else if other.sink != me.sink {
+                return Some(if me.sink { back as usize } else { a });
+            }
+        }
+        None
+    }
+
+    /// Sends what fits along the path through an arc between the trees.
+    fn augment(&mut self, bridge: usize) {
+        let Arc {
+            head: sink_end,
+            back,
+            residual,
+        } = self.arcs[bridge];
+        let source_end = self.arcs[back as usize].head;
+        let mut flow = residual;
+        for (end, sink) in [(source_end, false), (sink_end, true)] {
+            let mut v = end;
+            while self.nodes[v as usize].parent != ROOT {
+                let parent = self.arcs[self.nodes[v as usize].parent as usize];
+                flow = flow.min(if sink {
+                    parent.residual
+                } else {
+                    self.arcs[parent.back as usize].residual
+                });
+                v = parent.head;
+            }
+            flow = flow.min(self.terminal[v as usize].abs());
+        }
+        self.arcs[bridge].residual -= flow;
+        self.arcs[back as usize].residual += flow;
+        for (end, sink) in [(source_end, false), (sink_end, true)] {
+            let mut v = end;
+            while self.nodes[v as usize].parent != ROOT {
+                let up = self.nodes[v as usize].parent as usize;
+                let (head, down) = (self.arcs[up].head, self.arcs[up].back as usize);
+                let (gives, takes) = if sink { (up, down) } else { (down, up) };
+                self.arcs[gives].residual -= flow;
+                self.arcs[takes].residual += flow;
+                if self.arcs[gives].residual == 0 {
+                    self.nodes[v as usize].parent = ORPHAN;
+                    self.cut_off.push_front(v);
+                }
+                v = head;
+            }
+            self.terminal[v as usize] += if sink { flow } else { -flow };
+            if self.terminal[v as usize] == 0 {
+                self.nodes[v as usize].parent = ORPHAN;
+                self.cut_off.push_front(v);
+            }
+        }
+    }
+
+    /// Arcs from a node to its root, or `None` if the way ends at an orphan. Distances on the way are noted.
+    fn distance_to_root(&mut self, from: u32) -> Option<u32> {
+        let mut v = from;
+        let mut steps = 0;
+        let distance = loop {
+            let node = &mut self.nodes[v as usize];
+            if node.seen == self.now {
+                break steps + node.distance;
+            }
+            match node.parent {
+                ORPHAN | FREE => return None,
+                ROOT => {
+                    (node.seen, node.distance) = (self.now, 1);
+                    break steps + 1;
+                }
+                arc => {
+                    v = self.arcs[arc as usize].head;
+                    steps += 1;
+                }
+            }
+        };
+        let mut v = from;
+        let mut left = distance;
+        while self.nodes[v as usize].seen != self.now {
+            (self.nodes[v as usize].seen, self.nodes[v as usize].distance) = (self.now, left);
+            left -= 1;
+            v = self.arcs[self.nodes[v as usize].parent as usize].head;
+        }
+        Some(distance)
+    }
+
+    /// Hangs an orphan on the neighbour nearest to the root, or sets it free with all that hung on it.
+    fn adopt(&mut self, v: u32) {
+        let sink = self.nodes[v as usize].sink;
+        let mut best: Option<(u32, usize)> = None;
+        for a in self.arcs_of(v) {
+            let Arc { head, back, .. } = self.arcs[a];
+            // From the neighbour to here, away from the root.
+            if self.away(back as usize, sink) == 0 {
                 continue;
             }
-            let w = self.head[a as usize] as usize;
-            if self.residual[a as usize] > 0 && level[w] == level[v].wrapping_add(1) {
-                path.push(a);
-                v = w;
-            } else {
-                arc[v] = self.next[a as usize];
+            let other = self.nodes[head as usize];
+            if other.sink != sink || other.parent == FREE {
+                continue;
+            }
+            if let Some(distance) = self.distance_to_root(head)
+                && best.is_none_or(|(least, _)| distance < least)
+            {
+                best = Some((distance, a));
+            }
+        }
+        if let Some((distance, a)) = best {
+            let node = &mut self.nodes[v as usize];
+            node.parent = a as u32;
+            (node.seen, node.distance) = (self.now, distance + 1);
+            return;
+        }
+        self.nodes[v as usize].parent = FREE;
+        for a in self.arcs_of(v) {
+            let Arc { head, back, .. } = self.arcs[a];
+            let other = self.nodes[head as usize];
+            if other.sink != sink || other.parent == FREE {
+                continue;
+            }
+            if self.away(back as usize, sink) > 0 {
+                self.activate(head);
+            }
+            if other.parent < ORPHAN && self.arcs[other.parent as usize].head == v {
+                self.nodes[head as usize].parent = ORPHAN;
+                self.orphans.push_back(head);
             }
         }
     }
@@ -150,39 +345,118 @@ mod tests {
         total
     }
 
+    fn network(terminals: &[(i64, i64)], edges: &[(usize, usize, i64, i64)]) -> Network {
+        let mut network = Network::new(terminals.len());
+        for (v, &(on_sink, on_source)) in terminals.iter().enumerate() {
+            network.terminal(v, on_sink, on_source);
+        }
+        for &(a, b, f, w) in edges {
+            network.edge(a, b, f, w);
+        }
+        network
+    }
+
     #[test]
-    fn the_cut_is_minimal_on_every_small_graph() {
+    fn the_cut_is_the_minimal_one_with_the_fewest_sources_on_every_small_graph() {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(3);
         for round in 0..300 {
             let n = rng.random_range(1..=9usize);
+            // Few values, so that many cuts cost the same.
+            let most = if round % 2 == 0 { 20 } else { 4 };
             let terminals: Vec<_> = (0..n)
-                .map(|_| (rng.random_range(0..20i64), rng.random_range(0..20i64)))
+                .map(|_| (rng.random_range(0..most), rng.random_range(0..most)))
                 .collect();
             let edges: Vec<_> = (0..2 * n)
                 .map(|_| {
                     let (a, b) = (rng.random_range(0..n), rng.random_range(0..n));
-                    (a, b, rng.random_range(0..12i64), rng.random_range(0..12i64))
+                    (a, b, rng.random_range(0..most), rng.random_range(0..most))
                 })
                 .filter(|e| e.0 != e.1)
                 .collect();
-            let mut network = Network::new(n);
-            for (v, &(on_sink, on_source)) in terminals.iter().enumerate() {
-                network.terminal(v, on_sink, on_source);
-            }
-            for &(a, b, f, w) in &edges {
-                network.edge(a, b, f, w);
-            }
-            let found = cost(&network.sink_side(), &terminals, &edges);
+            let side = network(&terminals, &edges).sink_side();
             let least = (0..1usize << n)
                 .map(|m| {
-                    cost(
-                        &(0..n).map(|v| m >> v & 1 == 1).collect::<Vec<_>>(),
-                        &terminals,
-                        &edges,
-                    )
+                    let side: Vec<bool> = (0..n).map(|v| m >> v & 1 == 1).collect();
+                    let sources = side.iter().filter(|s| !**s).count();
+                    (cost(&side, &terminals, &edges), sources)
                 })
                 .min();
+            let sources = side.iter().filter(|s| !**s).count();
+            let found = (cost(&side, &terminals, &edges), sources);
             assert_eq!(Some(found), least, "round {round}");
+        }
+    }
+
+    /// Nodes the source does not reach after augmenting along shortest paths until there is none.
+    fn slowly(terminals: &[(i64, i64)], edges: &[(usize, usize, i64, i64)]) -> Vec<bool> {
+        let n = terminals.len();
+        let (s, t) = (n, n + 1);
+        let mut around: Vec<Vec<usize>> = vec![Vec::new(); n + 2];
+        let mut arcs: Vec<(usize, i64)> = Vec::new();
+        let ends = (terminals.iter().enumerate())
+            .flat_map(|(v, &(x, y))| [(s, v, x, 0), (v, t, y, 0)])
+            .chain(edges.iter().copied());
+        for (a, b, there, back) in ends {
+            around[a].push(arcs.len());
+            arcs.push((b, there));
+            around[b].push(arcs.len());
+            arcs.push((a, back));
+        }
+        loop {
+            let mut by = vec![None; n + 2];
+            let mut queue = VecDeque::from([s]);
+            while let Some(v) = queue.pop_front() {
+                for &a in &around[v] {
+                    let (w, left) = arcs[a];
+                    if left > 0 && w != s && by[w].is_none() {
+                        by[w] = Some(a);
+                        queue.push_back(w);
+                    }
+                }
+            }
+            if by[t].is_none() {
+                return (0..n).map(|v| by[v].is_none()).collect();
+            }
+            let mut path = Vec::new();
+            let mut v = t;
+            while let Some(a) = by[v] {
+                path.push(a);
+                v = arcs[a ^ 1].0;
+            }
+            let flow = path.iter().map(|a| arcs[*a].1).min().unwrap();
+            for a in path {
+                arcs[a].1 -= flow;
+                arcs[a ^ 1].1 += flow;
+            }
+        }
+    }
+
+    #[test]
+    fn larger_grids_are_cut_as_by_shortest_paths() {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(5);
+        for round in 0..12 {
+            let n = 24;
+            let most = if round % 2 == 0 { 1_000_000 } else { 5 };
+            let terminals: Vec<_> = (0..n * n)
+                .map(|_| match rng.random_range(0..6) {
+                    0 => (rng.random_range(0..3 * most), 0),
+                    1 => (0, rng.random_range(0..3 * most)),
+                    _ => (0, 0),
+                })
+                .collect();
+            let mut edges = Vec::new();
+            for y in 0..n {
+                for x in 0..n {
+                    let v = y * n + x;
+                    let right = (x + 1 < n).then_some(v + 1);
+                    let below = (y + 1 < n).then_some(v + n);
+                    for w in right.into_iter().chain(below) {
+                        edges.push((v, w, rng.random_range(0..most), rng.random_range(0..most)));
+                    }
+                }
+            }
+            let found = network(&terminals, &edges).sink_side();
+            assert!(found == slowly(&terminals, &edges), "round {round}");
         }
     }
 }

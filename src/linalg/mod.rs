@@ -10,6 +10,7 @@ pub mod ldlt;
 pub mod maxflow;
 pub mod nearest;
 pub mod panel;
+pub mod squares;
 
 #[cfg(test)]
 mod spectral_tests;

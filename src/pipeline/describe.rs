@@ -1,21 +1,22 @@
 //! The bytes of one mesh become its description: a pure function of bytes and parameters.
 
 use super::{Description, Params};
-use crate::descriptors;
+use crate::descriptors::{self, PointKernels};
 use crate::mesh::{self, CleanError, DualGraph, Format, ParseError, TriMesh};
 use crate::operators::{Laplacian, LaplacianError, laplacian};
 use crate::segmentation::patches;
-use crate::spectrum::{self, Spectrum, SpectrumError};
-use nalgebra::DMatrix;
+use crate::spectrum::{self, Eigenpairs, Progress, SpectrumError};
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
-pub const ALGORITHM_VERSION: u32 = 2;
+pub const ALGORITHM_VERSION: u32 = 3;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
 const MAX_EIGENVECTORS: usize = 100;
 /// Eigenpairs on meshes so small that a quarter of their vertices is fewer.
 const MIN_EIGENPAIRS: usize = 4;
+/// Vertices whose eigenvectors are copied and used together: few enough to stay in the cache.
+const BATCH: usize = 48;
 /// Patches of the over-segmentation.
 const N_PATCHES: usize = 80;
 
@@ -36,10 +37,10 @@ pub enum DescribeError {
 }
 
 /// The spectrum of a mesh with what was asked of it.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct MeshSpectrum {
     /// Eigenpairs, scaled to area 1.
-    pub spectrum: Spectrum,
+    pub spectrum: Eigenpairs,
     /// What it is the spectrum of.
     pub operator: Laplacian,
 }
@@ -84,10 +85,9 @@ pub fn describe(
     let found = spectrum_of(&proxy_mesh, &bridges, params, &whole)?;
     enter("descriptors")?;
     let dual = DualGraph::new(&proxy_mesh, &bridges);
-    let (values, vectors) = (&found.spectrum.eigenvalues, &found.spectrum.eigenvectors);
-    let times = descriptors::hks_times(values, N_HKS_TIMES);
-    let hks = descriptors::hks(values, vectors, &times);
-    let face = descriptors::face_descriptors(&proxy_mesh, &bridges, &dual, values, vectors);
+    let values = &found.spectrum.eigenvalues;
+    let points = point_arrays(&found.spectrum);
+    let face = descriptors::face_descriptors(&proxy_mesh, &bridges, &dual, &points.face_kernels);
     enter("patches")?;
     let patches = patches(&proxy_mesh, &dual, face.farthest_start, N_PATCHES);
     let signature = descriptors::signature(&proxy_mesh, &face, values);
@@ -101,16 +101,15 @@ pub fn describe(
     report.n_proxy_faces = proxy_mesh.faces.len();
     report.n_proxy_vertices = vertices.len();
     report.n_bridges = bridges.len();
-    let n_eigenvectors = vectors.ncols().min(MAX_EIGENVECTORS);
     Ok(Description {
         area: cleaned.area,
         report,
         faces: proxy_mesh.faces,
         mass: found.operator.mass.iter().map(|m| *m as f32).collect(),
         eigenvalues: values.clone(),
-        eigenvectors: row_major(vectors, n_eigenvectors),
-        n_eigenvectors,
-        hks,
+        eigenvectors: points.eigenvectors,
+        n_eigenvectors: points.n_eigenvectors,
+        hks: points.hks,
         n_descriptors: face.n,
         face_descriptors: face.data,
         patches,
@@ -125,7 +124,7 @@ pub fn describe(
 /// those of the solver: `spectrum.factor`, `spectrum.iterate` and so on, over and over.
 ///
 /// # Errors
-/// As [`laplacian`] and [`Spectrum::smallest`].
+/// As [`laplacian`] and [`Eigenpairs::smallest`].
 pub fn spectrum_of(
     mesh: &TriMesh,
     bridges: &[mesh::Bridge],
@@ -139,9 +138,9 @@ pub fn spectrum_of(
     if !stage("spectrum") {
         return Err(DescribeError::Cancelled("spectrum"));
     }
-    let part = |name: &str| stage(&format!("spectrum.{name}"));
+    let part = |progress: &Progress| stage(&format!("spectrum.{}", progress.stage));
     let options = spectrum::Options {
-        stage: Some(&part),
+        progress: Some(&part),
         threads: params.threads as usize,
         ..spectrum::Options::default()
     };
@@ -150,15 +149,48 @@ pub fn spectrum_of(
     if params.only_meaningful {
         k = k.min(n / 4).max(MIN_EIGENPAIRS.min(n));
     }
-    let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)?;
+    let spectrum = Eigenpairs::smallest(&operator.stiffness, &operator.mass, k, &options)?;
     Ok(MeshSpectrum { spectrum, operator })
 }
 
-/// The first `n` columns, row-major, in single precision.
-fn row_major(vectors: &DMatrix<f64>, n: usize) -> Vec<f32> {
-    let mut out = Vec::with_capacity(vectors.nrows() * n);
-    for v in 0..vectors.nrows() {
-        out.extend((0..n).map(|j| vectors[(v, j)] as f32));
+/// What is computed of each vertex from its row of eigenvectors.
+struct PointArrays {
+    /// The first of them `(n, n_eigenvectors)`, row-major.
+    eigenvectors: Vec<f32>,
+    n_eigenvectors: usize,
+    hks: Vec<f32>,
+    face_kernels: Vec<f64>,
+}
+
+/// One pass over the eigenvectors, from where the solver left them to what is kept.
+fn point_arrays(pairs: &Eigenpairs) -> PointArrays {
+    let (n, k) = (pairs.n(), pairs.k());
+    let times = descriptors::hks_times(&pairs.eigenvalues, N_HKS_TIMES);
+    let heat = PointKernels::new(&pairs.eigenvalues, &times, 0);
+    let of_faces = descriptors::face_kernels(&pairs.eigenvalues);
+    let n_eigenvectors = k.min(MAX_EIGENVECTORS);
+    let mut arrays = PointArrays {
+        eigenvectors: Vec::with_capacity(n * n_eigenvectors),
+        n_eigenvectors,
+        hks: Vec::with_capacity(n * N_HKS_TIMES),
+        face_kernels: vec![0.0; n * of_faces.n_columns()],
+    };
+    let mut rows = vec![0.0; BATCH * k];
+    let mut hks = vec![0.0; BATCH * N_HKS_TIMES];
+    for first in (0..n).step_by(BATCH) {
+        let count = BATCH.min(n - first);
+        let rows = &mut rows[..count * k];
+        pairs.rows(first, rows);
+        for row in rows.chunks_exact(k) {
+            let kept = row[..n_eigenvectors].iter().map(|x| *x as f32);
+            arrays.eigenvectors.extend(kept);
+        }
+        let hks = &mut hks[..count * N_HKS_TIMES];
+        heat.of_rows(rows, k, hks);
+        arrays.hks.extend(hks.iter().map(|x| *x as f32));
+        let width = of_faces.n_columns();
+        let out = &mut arrays.face_kernels[first * width..][..count * width];
+        of_faces.of_rows(rows, k, out);
     }
-    out
+    arrays
 }

@@ -2,6 +2,7 @@
 
 mod describe;
 mod exemplars;
+mod literal;
 mod place;
 mod recluster;
 mod split;
@@ -13,6 +14,7 @@ pub use describe::{
 pub use exemplars::{
     Given, Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach,
 };
+pub use literal::literal;
 pub use place::{
     Labelling, Prepared, Vote, carried, label, map, map_by_descriptors, map_from, unlikeness,
 };

@@ -41,14 +41,6 @@ impl Component {
         self.vertices.len()
     }
 
-    /// (vertex, row) in ascending order of the vertices.
-    pub(super) fn rows_by_vertex(&self) -> Vec<(u32, u32)> {
-        let rows = self.vertices.iter().zip(0..);
-        let mut out: Vec<_> = rows.map(|(&v, row)| (v, row)).collect();
-        out.sort_unstable();
-        out
-    }
-
     /// Puts the unit null vector of S into the first column.
     pub(super) fn set_null_vector(&self, vectors: &mut Basis) {
         let scale = self.area.sqrt();
@@ -63,27 +55,55 @@ impl Component {
         off_pivots(shift, |at| Factor::new(&self.analysis, &self.standard, at))
     }
 
-    /// Counts the eigenvalues of S below `shift`, moved as for [`Component::factor`].
-    pub(super) fn inertia(&self, shift: f64) -> Result<(Inertia, f64), LdltError> {
-        off_pivots(shift, |at| Inertia::new(&self.analysis, &self.standard, at))
+    /// Counts the eigenvalues of S below `shift`, moved as for [`Component::factor`]; a bound on the
+    /// perturbation below `enough` need not be sharp.
+    pub(super) fn inertia(&self, shift: f64, enough: f64) -> Result<(Inertia, f64), LdltError> {
+        off_pivots(shift, |at| {
+            Inertia::new(&self.analysis, &self.standard, at, enough)
+        })
     }
 
-    /// Rayleigh quotients λ and residuals `‖S x - λ x‖` of the unit vectors of panel `j`. W is
-    /// applied to differences along edges, so that large weights of sliver triangles do not amplify
-    /// the rounding of a sum that cancels.
-    pub(super) fn rayleigh(
+    /// Whether among the entries of an eigenvector of W of magnitude `most`, the largest, that of the
+    /// lowest vertex is negative. `vectors` are those of S.
+    pub(super) fn first_extreme_is_negative(
         &self,
         vectors: &Basis,
-        j: usize,
-        scratch: &mut Scratch,
-    ) -> ([f64; WIDTH], [f64; WIDTH]) {
-        let Scratch { x, phi, images } = scratch;
-        vectors.copy_panel(j, x);
+        pair: usize,
+        most: f64,
+    ) -> bool {
+        let rows = vectors.rows_of(pair / WIDTH).flatten();
+        let entries = rows.zip(&self.inverse_sqrt_mass);
+        let entries = entries.map(|(row, s)| row.0[pair % WIDTH] * s);
+        let extreme = entries.zip(&self.vertices).filter(|(x, _)| x.abs() == most);
+        extreme
+            .min_by_key(|(_, v)| **v)
+            .is_some_and(|(x, _)| x < 0.0)
+    }
+
+    /// Measures the unit vectors of panel `j`.
+    pub(super) fn rayleigh(&self, vectors: &Basis, j: usize, scratch: &mut Scratch) -> Measured {
+        vectors.copy_panel(j, &mut scratch.x);
+        self.measure(scratch)
+    }
+
+    /// Rayleigh quotients λ, residuals `S x - λ x` and extreme entries of `A^{-1/2} x` of the unit
+    /// vectors in `scratch.x`. W is applied to differences along edges, so that large weights of
+    /// sliver triangles do not amplify the rounding of a sum that cancels.
+    pub(super) fn measure(&self, scratch: &mut Scratch) -> Measured {
+        let Scratch { x, phi, residuals } = scratch;
         phi.clear();
-        images.clear();
+        residuals.clear();
         Arch::new().dispatch(|| {
-            let scaled = x.iter().zip(&self.inverse_sqrt_mass);
-            phi.extend(scaled.map(|(row, s)| Row(row.0.map(|v| v * s))));
+            let mut least = [f64::INFINITY; WIDTH];
+            let mut most = [f64::NEG_INFINITY; WIDTH];
+            for (row, s) in x.iter().zip(&self.inverse_sqrt_mass) {
+                let row = row.0.map(|v| v * s);
+                for ((low, high), v) in least.iter_mut().zip(&mut most).zip(row) {
+                    *low = if v < *low { v } else { *low };
+                    *high = if v > *high { v } else { *high };
+                }
+                phi.push(Row(row));
+            }
             let mut quotients = [0.0; WIDTH];
             for (i, x) in x[..self.n()].iter().enumerate() {
                 let (columns, values) = self.stiffness.row(i);
@@ -98,18 +118,32 @@ impl Component {
                     *a *= self.inverse_sqrt_mass[i];
                     *q += *a * v;
                 }
-                images.push(Row(image));
+                residuals.push(Row(image));
             }
             let mut sums = [0.0; WIDTH];
-            for (image, x) in images.iter().zip(x) {
-                for (((s, a), v), l) in sums.iter_mut().zip(&image.0).zip(&x.0).zip(&quotients) {
-                    let r = a - l * v;
-                    *s += r * r;
+            for (image, x) in residuals.iter_mut().zip(&*x) {
+                let entries = sums.iter_mut().zip(&mut image.0).zip(&x.0).zip(&quotients);
+                for (((s, a), v), l) in entries {
+                    *a -= l * v;
+                    *s += *a * *a;
                 }
             }
-            (quotients, sums.map(f64::sqrt))
+            residuals.resize(x.len(), Row::ZERO);
+            Measured {
+                quotients,
+                residuals: sums.map(f64::sqrt),
+                extremes: std::array::from_fn(|i| (least[i], most[i])),
+            }
         })
     }
+}
+
+/// What [`Component::measure`] finds of the columns of a panel.
+pub(super) struct Measured {
+    pub(super) quotients: [f64; WIDTH],
+    pub(super) residuals: [f64; WIDTH],
+    /// (least, most)
+    pub(super) extremes: [(f64, f64); WIDTH],
 }
 
 /// Calls `factorise` at `shift`, or a little above it where that hits a pivot exactly.
@@ -129,12 +163,14 @@ fn off_pivots<T>(
     unreachable!("the last attempt returns")
 }
 
-/// Memory of [`Component::rayleigh`], for one panel after the other.
+/// Memory of [`Component::measure`], for one panel after the other.
 #[derive(Default)]
 pub(super) struct Scratch {
-    x: Vec<Row>,
+    /// The panel.
+    pub(super) x: Vec<Row>,
     phi: Vec<Row>,
-    images: Vec<Row>,
+    /// Its residuals.
+    pub(super) residuals: Vec<Row>,
 }
 
 /// Checks both matrices.
@@ -159,30 +195,53 @@ pub(super) fn validate(stiffness: &sprs::CsMat<f64>, mass: &[f64]) -> Result<(),
     let diagonal: Vec<f64> = (0..rows)
         .map(|i| stiffness.get(i, i).copied().unwrap_or(0.0).abs())
         .collect();
-    for (outer, vector) in stiffness.outer_iterator().enumerate() {
-        for (inner, &value) in vector.iter() {
+    let view = |i: usize| {
+        let row = stiffness.outer_view(i);
+        row.expect("invariant: i is below the size of W")
+    };
+    // Entries beyond the diagonal are met by their mirror images in their own order.
+    let mut waiting: Vec<usize> = (0..rows)
+        .map(|i| view(i).indices().partition_point(|&c| c <= i))
+        .collect();
+    let check = |row: usize, column: usize, value: f64, mirror: f64| {
+        let scale = diagonal[row].max(diagonal[column]);
+        if (value - mirror).abs() > ASYMMETRY * scale {
+            return Err(SpectrumError::NotSymmetric {
+                row,
+                column,
+                value,
+                mirror,
+            });
+        }
+        Ok(())
+    };
+    for row in 0..rows {
+        for (column, &value) in view(row).iter() {
             if !value.is_finite() {
-                return Err(SpectrumError::Stiffness {
-                    row: outer,
-                    column: inner,
-                    value,
-                });
+                return Err(SpectrumError::Stiffness { row, column, value });
             }
-            if inner > outer {
+            if column >= row {
                 continue;
             }
-            let mirror = stiffness
-                .get_outer_inner(inner, outer)
-                .copied()
-                .unwrap_or(0.0);
-            if (value - mirror).abs() > ASYMMETRY * diagonal[outer].max(diagonal[inner]) {
-                return Err(SpectrumError::NotSymmetric {
-                    row: outer,
-                    column: inner,
-                    value,
-                    mirror,
-                });
+            let above = view(column);
+            let (columns, values) = (above.indices(), above.data());
+            let at = &mut waiting[column];
+            while columns.get(*at).is_some_and(|&c| c < row) {
+                check(column, columns[*at], values[*at], 0.0)?;
+                *at += 1;
             }
+            if columns.get(*at) == Some(&row) {
+                check(row, column, value, values[*at])?;
+                *at += 1;
+            } else {
+                check(row, column, value, 0.0)?;
+            }
+        }
+    }
+    for (row, &at) in waiting.iter().enumerate() {
+        let rest = view(row);
+        for (&column, &value) in rest.indices()[at..].iter().zip(&rest.data()[at..]) {
+            check(row, column, value, 0.0)?;
         }
     }
     Ok(())

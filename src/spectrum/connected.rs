@@ -21,6 +21,8 @@ pub(super) struct Pairs {
     pub(super) values: Vec<f64>,
     /// `‖S x - λ x‖` of each.
     pub(super) residuals: Vec<f64>,
+    /// Least and largest entry of each eigenvector of W.
+    pub(super) extremes: Vec<(f64, f64)>,
     /// Orthonormal eigenvectors of S, rows in elimination order.
     pub(super) vectors: Basis,
     /// Every eigenvalue below this is among `values`.
@@ -29,6 +31,8 @@ pub(super) struct Pairs {
     pub(super) margin: f64,
     /// Bound on the perturbation of S under which the count at `limit` is exact.
     pub(super) perturbation: f64,
+    /// Growth of the pivots where it was counted; 1 for a dense solve.
+    pub(super) growth: f64,
     /// Dimension of the Krylov space; 0 for a dense solve.
     pub(super) n_krylov: usize,
     /// Rounds of inverse iteration and of looking for missing pairs.
@@ -58,19 +62,41 @@ pub(super) fn smallest(
     Lanczos { component, setting }.run(k)
 }
 
-/// Where to put the limit above pair `j` when `values` are ascending: the first gap at or after k
-/// that is not the inside of a cluster. Returns (number of pairs below, limit, margin).
-pub(super) fn gap_after(values: &[f64], k: usize, n: usize) -> Option<(usize, f64, f64)> {
+/// A place between two eigenvalues.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Gap {
+    /// Pairs below.
+    pub(super) count: usize,
+    pub(super) limit: f64,
+    /// Distance from the limit to the last of them.
+    pub(super) margin: f64,
+}
+
+/// Where to put the limit when `values` are ascending: in the first gap at or after pair k that is
+/// not the inside of a cluster, and that has room for a margin above `least`, which is 0 as a rule.
+pub(super) fn gap_after(values: &[f64], k: usize, n: usize, least: f64) -> Option<Gap> {
     for j in k..=values.len() {
         if j == n {
-            return Some((n, f64::INFINITY, f64::INFINITY));
+            return Some(Gap {
+                count: n,
+                limit: f64::INFINITY,
+                margin: f64::INFINITY,
+            });
         }
         if j < values.len() {
             let gap = values[j] - values[j - 1];
             let mean_spacing = values[j] / (j + 1) as f64;
-            if gap > 0.02 * mean_spacing {
-                let margin = 0.3 * gap.min(mean_spacing);
-                return Some((j, values[j - 1] + margin, margin));
+            // Near the pair below, which is known best; in the middle where a wide margin is called for.
+            let margin = match least > 0.0 {
+                true => 0.5 * gap,
+                false => 0.3 * gap.min(mean_spacing),
+            };
+            if gap > 0.02 * mean_spacing && margin > least {
+                return Some(Gap {
+                    count: j,
+                    limit: values[j - 1] + margin,
+                    margin,
+                });
             }
         }
     }
@@ -103,7 +129,18 @@ pub(super) fn dense(
     if component.has_null_vector {
         values[0] = 0.0;
     }
-    let (j, limit, margin) = gap_after(&values, k, n).unwrap_or((n, f64::INFINITY, f64::INFINITY));
+    let perturbation = n as f64 * f64::EPSILON * largest;
+    let gap = gap_after(&values, k, n, 0.0).filter(|gap| gap.margin > perturbation);
+    let gap = gap.or_else(|| gap_after(&values, k, n, 2.0 * perturbation));
+    let Gap {
+        count: j,
+        limit,
+        margin,
+    } = gap.unwrap_or(Gap {
+        count: n,
+        limit: f64::INFINITY,
+        margin: f64::INFINITY,
+    });
     let mut basis = Basis::new(n, j.div_ceil(WIDTH), setting.parallel);
     // The null vector is known exactly: the others are made orthogonal to it, not to what came out.
     let mut null = Basis::new(n, 1, setting.parallel);
@@ -128,14 +165,16 @@ pub(super) fn dense(
     let mut pairs = Pairs {
         values,
         residuals: Vec::new(),
+        extremes: Vec::new(),
         vectors: basis,
         limit,
         margin,
-        perturbation: n as f64 * f64::EPSILON * largest,
+        perturbation,
+        growth: 1.0,
         n_krylov: 0,
         n_polish: 0,
         n_repair: 0,
     };
-    verify_and_polish(component, setting, &mut pairs)?;
+    verify_and_polish(component, setting, None, &mut pairs)?;
     Ok(pairs)
 }

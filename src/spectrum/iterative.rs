@@ -3,11 +3,11 @@
 
 use super::SpectrumError;
 use super::component::Component;
-use super::connected::{Pairs, Setting, dense, gap_after};
+use super::connected::{Gap, Pairs, Setting, dense, gap_after};
 use super::polish::verify_and_polish;
 use crate::linalg::basis::Basis;
 use crate::linalg::block_lanczos::{BlockLanczos, Projection};
-use crate::linalg::ldlt::Factor;
+use crate::linalg::ldlt::{Factor, Inertia};
 use crate::linalg::panel::{Row, WIDTH, zero_panel};
 
 /// Rounds in which eigenvalues that the count says are missing are looked for.
@@ -16,6 +16,10 @@ const MAX_REPAIR: usize = 12;
 /// A Krylov space that has grown to this many vectors for each pair wanted (and 1,600 more) will not
 /// converge: the spectrum is one cluster.
 const MOST_VECTORS: usize = 6;
+
+/// Where the bound on rounding is too large for a gap, a wider one is looked for among so many more pairs, and this share.
+const FURTHER_PAIRS: usize = 16;
+const FURTHER_SHARE: usize = 8;
 
 /// Where the Krylov space does not converge, components up to this size are solved densely.
 const DENSE_AT_MOST: usize = 4_000;
@@ -65,7 +69,7 @@ impl Lanczos<'_> {
         for _ in 0..60 {
             self.setting.hook.enter("factor")?;
             let (factor, at) = self.component.factor(shift)?;
-            let count = factor.inertia.n_negative as f64;
+            let count = factor.n_negative as f64;
             if count >= FEWEST_BELOW * k && count <= (MOST_BELOW * k).max(1.0) {
                 return Ok((factor, at));
             }
@@ -82,7 +86,7 @@ impl Lanczos<'_> {
                 true => (low * high).sqrt(),
                 false => aimed,
             };
-            let usable = factor.inertia.n_negative < k as usize;
+            let usable = factor.n_negative < k as usize;
             if usable {
                 best = Some((factor, at));
             }
@@ -107,7 +111,7 @@ impl Lanczos<'_> {
             locked.push(&zero_panel(n));
             self.component.set_null_vector(&mut locked);
         }
-        let n_below = factor.inertia.n_negative.saturating_sub(self.n_null());
+        let n_below = factor.n_negative.saturating_sub(self.n_null());
         let capacity = ((n - self.n_null()) / WIDTH - 2).min((MOST_VECTORS * k + 1_600) / WIDTH);
         let mut space = BlockLanczos::new(
             n,
@@ -117,28 +121,49 @@ impl Lanczos<'_> {
             self.setting.parallel,
         )?;
         let mut target = first_dimension(k).min(capacity * WIDTH);
-        let (ritz, projection, below) = loop {
-            hook.enter("iterate")?;
+        // A margin that a gap must have, once a bound turned out to be too large.
+        let mut least = 0.0;
+        let (ritz, projection, gap, counted) = loop {
             while space.dimension() < target {
+                hook.at("iterate", space.dimension(), target)?;
                 space.step(&|panel: &mut [Row]| factor.solve(panel, self.setting.parallel))?;
-                hook.enter("iterate")?;
             }
             hook.enter("check")?;
             let projection = space.projection()?;
             let ritz = self.ritz(&projection, shift);
-            let worst = self.worst(&ritz, k - self.n_null().min(k));
             let below = ritz.pairs.iter().filter(|p| p.0 < shift).count();
-            let gap = self.gap(&ritz, k);
-            if worst <= 1.0
-                && below >= n_below
-                && let Some((j, _, _)) = gap
-                && self.worst(&ritz, j - self.n_null()) <= 1.0
-            {
-                break (ritz, projection, j);
+            let mut worst = self.worst(&ritz, k - self.n_null().min(k));
+            let mut gap = self.gap(&ritz, k, least);
+            if let Some(gap) = gap {
+                worst = worst.max(self.worst(&ritz, gap.count - self.n_null()));
+            }
+            if let (true, true, Some(mut found)) = (worst <= 1.0, below >= n_below, gap) {
+                hook.enter("certify")?;
+                let counted = self.component.inertia(found.limit, found.margin)?;
+                found.limit = counted.1;
+                if counted.0.perturbation < found.margin {
+                    break (ritz, projection, found, counted.0);
+                }
+                least = 2.0 * counted.0.perturbation;
+                gap = self.gap(&ritz, k, least);
+                let further = k + FURTHER_PAIRS + k / FURTHER_SHARE;
+                match gap.filter(|g| g.count <= further && g.count > found.count) {
+                    None => break (ritz, projection, found, counted.0),
+                    Some(wider) => {
+                        worst = self.worst(&ritz, wider.count - self.n_null());
+                        if worst <= 1.0 {
+                            continue;
+                        }
+                    }
+                }
             }
             if space.dimension() + WIDTH > capacity * WIDTH {
                 if n <= DENSE_AT_MOST {
                     return dense(self.component, k, self.setting);
+                }
+                if gap.is_none() {
+                    let n_krylov = space.dimension();
+                    return Err(SpectrumError::NoGap { k, n_krylov });
                 }
                 return Err(SpectrumError::NotConverged {
                     k,
@@ -150,8 +175,7 @@ impl Lanczos<'_> {
         };
         hook.enter("vectors")?;
         let n_krylov = space.dimension();
-        let count = below - self.n_null();
-        let found = &ritz.pairs[..count];
+        let found = &ritz.pairs[..gap.count - self.n_null()];
         let null = self.component.has_null_vector;
         let chosen: Vec<Option<usize>> = null
             .then_some(None)
@@ -164,22 +188,21 @@ impl Lanczos<'_> {
         if null {
             self.component.set_null_vector(&mut vectors);
         }
-        let (_, limit, margin) = self
-            .gap(&ritz, k)
-            .ok_or(SpectrumError::NoGap { k, n_krylov })?;
         let mut pairs = Pairs {
             values,
             residuals: Vec::new(),
+            extremes: Vec::new(),
             vectors,
-            limit,
-            margin,
+            limit: gap.limit,
+            margin: gap.margin,
             perturbation: 0.0,
+            growth: 1.0,
             n_krylov,
             n_polish: 0,
             n_repair: 0,
         };
-        self.complete(&factor, shift, &mut pairs)?;
-        verify_and_polish(self.component, self.setting, &mut pairs)?;
+        self.complete(&factor, shift, counted, &mut pairs)?;
+        verify_and_polish(self.component, self.setting, Some(&factor), &mut pairs)?;
         Ok(pairs)
     }
 
@@ -212,13 +235,13 @@ impl Lanczos<'_> {
             .fold(0.0, f64::max)
     }
 
-    fn gap(&self, ritz: &Ritz, k: usize) -> Option<(usize, f64, f64)> {
+    fn gap(&self, ritz: &Ritz, k: usize, least: f64) -> Option<Gap> {
         let nulls = std::iter::repeat_n(0.0, self.n_null());
         let values: Vec<f64> = nulls.chain(ritz.pairs.iter().map(|p| p.0)).collect();
         if values.len() <= k {
             return None;
         }
-        gap_after(&values, k, self.component.n())
+        gap_after(&values, k, self.component.n(), least)
     }
 
     /// Compares the count of eigenvalues below the limit with the pairs found, and looks for
@@ -227,14 +250,14 @@ impl Lanczos<'_> {
         &self,
         factor: &Factor,
         shift: f64,
+        counted: Inertia,
         pairs: &mut Pairs,
     ) -> Result<(), SpectrumError> {
+        let limit = pairs.limit;
+        pairs.perturbation = counted.perturbation;
+        pairs.growth = counted.growth;
         for round in 0..=MAX_REPAIR {
-            self.setting.hook.enter("certify")?;
-            let (at_limit, limit) = self.component.inertia(pairs.limit)?;
-            pairs.limit = limit;
-            pairs.perturbation = at_limit.perturbation;
-            let (expected, found) = (at_limit.n_negative, pairs.values.len());
+            let (expected, found) = (counted.n_negative, pairs.values.len());
             if expected == found {
                 return Ok(());
             }
@@ -276,7 +299,7 @@ impl Lanczos<'_> {
         let mut target = (4 * WIDTH + wanted * 3 / 2).next_multiple_of(WIDTH);
         loop {
             while space.dimension() < target.min(capacity * WIDTH) {
-                self.setting.hook.enter("repair")?;
+                self.setting.hook.at("repair", space.dimension(), target)?;
                 space.step(&|panel: &mut [Row]| factor.solve(panel, self.setting.parallel))?;
             }
             let projection = space.projection()?;
@@ -312,5 +335,7 @@ impl Lanczos<'_> {
         let n = self.component.n();
         pairs.vectors = Basis::of_columns(n, self.setting.parallel, &sources, &columns);
         pairs.values = order.iter().map(|o| o.0).collect();
+        let last = pairs.values[pairs.values.len() - 1];
+        pairs.margin = pairs.margin.min(pairs.limit - last);
     }
 }

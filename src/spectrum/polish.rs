@@ -4,15 +4,20 @@
 #![allow(clippy::needless_range_loop)]
 
 use super::SpectrumError;
-use super::component::{Component, Scratch};
+use super::component::{Component, Measured, Scratch};
 use super::connected::{Pairs, Setting};
 use crate::linalg::basis::Basis;
 use crate::linalg::dense_eigen::symmetric_eigen;
+use crate::linalg::ldlt::Factor;
 use crate::linalg::panel::{Row, Tile, WIDTH, ZERO_TILE};
-use rayon::prelude::{IntoParallelIterator, ParallelIterator};
+use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 
 /// Pairs whose residuals are at most this share of what is allowed are left as they are.
 const GOOD_ENOUGH: f64 = 0.3;
+
+/// So many pairs, or this share of all, are corrected one panel after the other.
+const FEW: usize = 16;
+const FEW_OF: usize = 8;
 
 /// Inner products above this have squares that count.
 const SMALL_TURN: f64 = 1e-6;
@@ -23,24 +28,32 @@ const CLUSTER: f64 = 1.5;
 /// Rounds of inverse iteration with a definite factor before a residual is given up.
 const MAX_POLISH: usize = 4;
 
-/// Measures the residuals; while one is too large, improves the worse ones by inverse iteration with
-/// a definite factor (no growth, whatever the mesh) and a Rayleigh–Ritz step.
+/// Measures the residuals. While one is too large, improves the worse ones: where they are few, by a
+/// correction with the `factor` at the interior shift, if there is one; where they are many, or that
+/// does not suffice, by inverse iteration with a definite factor (no growth, whatever the mesh) and a
+/// Rayleigh–Ritz step.
 pub(super) fn verify_and_polish(
     component: &Component,
     setting: &Setting,
+    factor: Option<&Factor>,
     pairs: &mut Pairs,
 ) -> Result<(), SpectrumError> {
+    let parallel = setting.parallel;
     let mut best = f64::INFINITY;
-    for round in 0..=MAX_POLISH {
-        setting.hook.enter("verify")?;
-        measure(component, setting.parallel, pairs);
+    let mut factor = factor;
+    let mut n_definite = 0;
+    let all = 0..pairs.vectors.n_panels();
+    setting.hook.enter("verify")?;
+    measure(component, parallel, pairs, all.clone());
+    loop {
         let ratios = ratios(pairs, setting.tolerance);
         let index = worst(&ratios);
         let ratio = ratios[index];
         if ratio <= 1.0 {
             return Ok(());
         }
-        if round == MAX_POLISH || ratio.is_nan() || ratio > 0.5 * best {
+        let stuck = ratio.is_nan() || ratio > 0.5 * best;
+        if ratio.is_nan() || n_definite == MAX_POLISH || (stuck && factor.is_none()) {
             return Err(SpectrumError::Residual {
                 index,
                 eigenvalue: pairs.values[index],
@@ -53,37 +66,106 @@ pub(super) fn verify_and_polish(
         pairs.n_polish += 1;
         let first = usize::from(component.has_null_vector);
         let poor = (first..ratios.len()).filter(|&i| ratios[i] > GOOD_ENOUGH);
-        polish(
-            component,
-            setting.parallel,
-            pairs,
-            &poor.collect::<Vec<_>>(),
-        )?;
+        let poor: Vec<usize> = poor.collect();
+        let few = poor.len() <= FEW.max(pairs.values.len() / FEW_OF);
+        if stuck || !few {
+            factor = None;
+            best = f64::INFINITY;
+        }
+        match factor {
+            Some(factor) => {
+                correct(component, parallel, factor, pairs, &poor);
+                setting.hook.enter("verify")?;
+                let mut changed: Vec<usize> = poor.iter().map(|i| i / WIDTH).collect();
+                changed.dedup();
+                measure(component, parallel, pairs, changed);
+            }
+            None => {
+                n_definite += 1;
+                polish(component, parallel, pairs, &poor)?;
+                setting.hook.enter("verify")?;
+                measure(component, parallel, pairs, all.clone());
+            }
+        }
     }
-    Ok(())
 }
 
-/// Replaces the values by Rayleigh quotients, and measures the residuals.
-fn measure(component: &Component, parallel: bool, pairs: &mut Pairs) {
+/// Replaces the values by Rayleigh quotients, and measures the residuals, in the panels listed, in
+/// ascending order.
+fn measure(
+    component: &Component,
+    parallel: bool,
+    pairs: &mut Pairs,
+    panels: impl IntoIterator<Item = usize>,
+) {
     let of_panel = |scratch: &mut Scratch, p: usize| {
-        let (mut quotients, residuals) = component.rayleigh(&pairs.vectors, p, scratch);
+        let mut measured = component.rayleigh(&pairs.vectors, p, scratch);
         if component.has_null_vector && p == 0 {
-            quotients[0] = 0.0;
+            measured.quotients[0] = 0.0;
         }
-        (quotients, residuals)
+        measured
     };
-    let panels = 0..pairs.vectors.n_panels();
-    let measured: Vec<_> = if parallel {
-        let panels = panels.into_par_iter();
-        panels.map_init(Scratch::default, of_panel).collect()
+    let panels: Vec<usize> = panels.into_iter().collect();
+    let measured: Vec<Measured> = if parallel {
+        let panels = panels.par_iter();
+        panels
+            .map_init(Scratch::default, |scratch, &p| of_panel(scratch, p))
+            .collect()
     } else {
         let mut scratch = Scratch::default();
-        panels.map(|p| of_panel(&mut scratch, p)).collect()
+        let panels = panels.iter();
+        panels.map(|&p| of_panel(&mut scratch, p)).collect()
     };
     let k = pairs.values.len();
-    let (quotients, residuals): (Vec<_>, Vec<_>) = measured.into_iter().unzip();
-    pairs.values = quotients.into_iter().flatten().take(k).collect();
-    pairs.residuals = residuals.into_iter().flatten().take(k).collect();
+    pairs.residuals.resize(k, 0.0);
+    pairs.extremes.resize(k, (0.0, 0.0));
+    for (p, measured) in panels.into_iter().zip(measured) {
+        for column in 0..WIDTH.min(k - p * WIDTH) {
+            let pair = p * WIDTH + column;
+            pairs.values[pair] = measured.quotients[column];
+            pairs.residuals[pair] = measured.residuals[column];
+            pairs.extremes[pair] = measured.extremes[column];
+        }
+    }
+}
+
+/// Corrects the pairs at `poor`, ascending: what their residuals r, measured on W, have outside of the
+/// span of all pairs is solved for and subtracted.
+///
+/// `x - (S - σ)⁻¹ r` is what a step of inverse iteration at σ makes of x, to first order in the error. But the
+/// rounding of the factor, which is what left x as it is, now acts on a correction of the size of r. Errors
+/// of x along eigenvectors far above σ, nearly all of them, vanish; those up to 2 σ may grow
+/// by half. Lengths and angles change by the square of the error.
+fn correct(
+    component: &Component,
+    parallel: bool,
+    factor: &Factor,
+    pairs: &mut Pairs,
+    poor: &[usize],
+) {
+    let mut scratch = Scratch::default();
+    for group in poor.chunks(WIDTH) {
+        let rows: usize = pairs.vectors.rows_of(0).map(<[Row]>::len).sum();
+        scratch.x.clear();
+        scratch.x.resize(rows, Row::ZERO);
+        for (to, &pair) in group.iter().enumerate() {
+            let from = pairs.vectors.rows_of(pair / WIDTH).flatten();
+            for (x, row) in scratch.x.iter_mut().zip(from) {
+                x.0[to] = row.0[pair % WIDTH];
+            }
+        }
+        component.measure(&mut scratch);
+        let correction = &mut scratch.residuals;
+        pairs.vectors.remove(0, [&mut correction[..]]);
+        factor.solve(correction, parallel);
+        pairs.vectors.remove(0, [&mut correction[..]]);
+        for (from, &pair) in group.iter().enumerate() {
+            let to = pairs.vectors.rows_of_mut(pair / WIDTH).flatten();
+            for (row, x) in to.zip(correction.iter()) {
+                row.0[pair % WIDTH] -= x.0[from];
+            }
+        }
+    }
 }
 
 /// The residuals in units of what is allowed, `tolerance · max(λ, λ₊)`.
@@ -119,9 +201,9 @@ fn polish(
     let (n, k) = (component.n(), poor.len());
     let largest = pairs.values[pairs.values.len() - 1];
     let (factor, shift) = component.factor(-0.02 * largest.abs().max(f64::MIN_POSITIVE))?;
-    if factor.inertia.n_negative > 0 {
+    if factor.n_negative > 0 {
         return Err(SpectrumError::NotSemidefinite {
-            count: factor.inertia.n_negative,
+            count: factor.n_negative,
             below: shift,
         });
     }

@@ -1,19 +1,19 @@
-use super::{Options, Spectrum, SpectrumError};
+use super::{Options, Progress, Spectrum, SpectrumError};
 use crate::operators::test_meshes::{bumpy_torus, icosphere};
 use crate::operators::{Operator, laplacian};
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 
 #[test]
 fn cancels_at_every_stage() {
     let operator = laplacian(&bumpy_torus(40, 30), &[], Operator::Tufted).unwrap();
     let run = |stop_after: usize| {
         let calls = Cell::new(0);
-        let hook = |_: &str| {
+        let hook = |_: &Progress| {
             calls.set(calls.get() + 1);
             calls.get() <= stop_after
         };
         let options = Options {
-            stage: Some(&hook),
+            progress: Some(&hook),
             ..Options::default()
         };
         let result = Spectrum::smallest(&operator.stiffness, &operator.mass, 60, &options);
@@ -26,6 +26,32 @@ fn cancels_at_every_stage() {
         assert!(matches!(result, Err(SpectrumError::Cancelled { .. })));
         assert_eq!(calls, stop_after + 1, "nothing is called after a cancel");
     }
+}
+
+#[test]
+fn tells_how_far_it_is() {
+    let operator = laplacian(&bumpy_torus(60, 40), &[], Operator::Tufted).unwrap();
+    let seen = RefCell::new(Vec::new());
+    let hook = |p: &Progress| {
+        seen.borrow_mut().push(*p);
+        true
+    };
+    let options = Options {
+        progress: Some(&hook),
+        ..Options::default()
+    };
+    let found = Spectrum::smallest(&operator.stiffness, &operator.mass, 50, &options).unwrap();
+    let iterate: Vec<Progress> = seen
+        .take()
+        .into_iter()
+        .filter(|p| p.stage == "iterate")
+        .collect();
+    // One call a block, each with more vectors than the one before; the last ends the space.
+    assert!(iterate.windows(2).all(|w| w[0].done < w[1].done));
+    assert!(iterate.iter().all(|p| p.done < p.expected));
+    let n_krylov = found.certificate.n_krylov;
+    assert_eq!(iterate.len(), n_krylov / crate::linalg::panel::WIDTH);
+    assert_eq!(iterate[iterate.len() - 1].expected, n_krylov);
 }
 
 #[test]

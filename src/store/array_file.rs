@@ -76,6 +76,7 @@ pub enum ArrayFileError {
 }
 
 /// One array of a description: its name, element type and shape, and where its bytes are.
+#[derive(Debug)]
 struct Array<'a> {
     name: &'static str,
     dtype: Dtype,
@@ -83,53 +84,83 @@ struct Array<'a> {
     bytes: &'a [u8],
 }
 
-/// The file's bytes for a description. The same description and parameters give the same bytes.
-///
-/// `params_json` is kept as it is, for people and for recomputing. A description whose arrays do not
-/// fit each other is refused with the array's name.
+/// An array file in pieces, to be written one after the other: the header, and the arrays where they are
+/// in the description, of which no second copy is made.
+#[derive(Debug)]
+pub struct DescriptionFile<'a> {
+    header: Vec<u8>,
+    arrays: [Array<'a>; 11],
+}
+
+impl<'a> DescriptionFile<'a> {
+    /// The file of a description. The same description and parameters give the same bytes.
+    ///
+    /// `params_json` is kept as it is, for people and for recomputing. A description whose arrays do
+    /// not fit each other is refused with the array's name.
+    pub fn new(description: &'a Description, params_json: &str) -> Result<Self, ArrayFileError> {
+        let view = description.view();
+        let arrays = arrays(&view)?;
+        check_indices(&view)?;
+        let mut metadata = serde_json::Map::new();
+        metadata.insert("format".into(), ARRAY_FORMAT.to_string().into());
+        metadata.insert("area".into(), description.area.to_string().into());
+        metadata.insert("params".into(), params_json.into());
+        for (key, value) in description.report.counts() {
+            metadata.insert(key.into(), value.to_string().into());
+        }
+        let places = arrays.iter().map(|a| (a.name, a.dtype, a.shape.as_slice()));
+        let header = header(Some(metadata), places);
+        Ok(Self { header, arrays })
+    }
+
+    /// What the file consists of.
+    pub fn pieces(&self) -> Vec<&[u8]> {
+        let arrays = self.arrays.iter().map(|a| a.bytes);
+        std::iter::once(self.header.as_slice())
+            .chain(arrays)
+            .collect()
+    }
+}
+
+/// The file's bytes for a description: those of [`DescriptionFile`] in one piece.
 pub fn write_description(
     description: &Description,
     params_json: &str,
 ) -> Result<Vec<u8>, ArrayFileError> {
-    let view = description.view();
-    let arrays = arrays(&view)?;
-    check_indices(&view)?;
+    Ok(DescriptionFile::new(description, params_json)?
+        .pieces()
+        .concat())
+}
 
-    let mut metadata = serde_json::Map::new();
-    metadata.insert("format".into(), ARRAY_FORMAT.to_string().into());
-    metadata.insert("area".into(), description.area.to_string().into());
-    metadata.insert("params".into(), params_json.into());
-    for (key, value) in description.report.counts() {
-        metadata.insert(key.into(), value.to_string().into());
-    }
+/// The header of a safetensors file whose arrays follow each other: its length, JSON, and spaces up to
+/// where the data begins.
+pub(super) fn header<'a>(
+    metadata: Option<serde_json::Map<String, serde_json::Value>>,
+    arrays: impl Iterator<Item = (&'a str, Dtype, &'a [usize])>,
+) -> Vec<u8> {
     let mut header = serde_json::Map::new();
-    header.insert("__metadata__".into(), metadata.into());
+    if let Some(metadata) = metadata {
+        header.insert("__metadata__".into(), metadata.into());
+    }
     let mut end = 0;
-    for array in &arrays {
+    for (name, dtype, shape) in arrays {
         let begin = end;
-        end += array.bytes.len();
+        end += shape.iter().product::<usize>() * dtype.bitsize() / 8;
         header.insert(
-            array.name.into(),
+            name.into(),
             serde_json::json!({
-                "dtype": array.dtype.to_string(),
-                "shape": array.shape,
+                "dtype": dtype.to_string(),
+                "shape": shape,
                 "data_offsets": [begin, end],
             }),
         );
     }
-    let mut header = serde_json::Value::from(header).to_string().into_bytes();
-    header.resize(
-        (8 + header.len()).next_multiple_of(DATA_ALIGNMENT) - 8,
-        b' ',
-    );
-
-    let mut file = Vec::with_capacity(8 + header.len() + end);
-    file.extend_from_slice(&(header.len() as u64).to_le_bytes());
-    file.extend_from_slice(&header);
-    for array in &arrays {
-        file.extend_from_slice(array.bytes);
-    }
-    Ok(file)
+    let text = serde_json::Value::from(header).to_string();
+    let length = (8 + text.len()).next_multiple_of(DATA_ALIGNMENT) - 8;
+    let mut bytes = (length as u64).to_le_bytes().to_vec();
+    bytes.extend_from_slice(text.as_bytes());
+    bytes.resize(8 + length, b' ');
+    bytes
 }
 
 /// The arrays of a description in file order: the 8-byte one first.

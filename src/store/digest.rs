@@ -14,6 +14,15 @@ impl Digest {
         Self(*blake3::hash(bytes).as_bytes())
     }
 
+    /// The digest of pieces that follow each other.
+    pub fn of_pieces(pieces: &[&[u8]]) -> Self {
+        let mut hasher = blake3::Hasher::new();
+        for piece in pieces {
+            hasher.update(piece);
+        }
+        Self(*hasher.finalize().as_bytes())
+    }
+
     /// The name of a description: the digest of the original's digest, the parameters it was
     /// computed with and the algorithm (its version, and whatever else decides the bits). Each is
     /// prefixed with its length, so that no two triples run together.
@@ -77,6 +86,7 @@ mod tests {
     #[test]
     fn a_digest_reads_back_from_its_text() {
         let digest = Digest::of(b"abc");
+        assert_eq!(Digest::of_pieces(&[b"a", b"", b"bc"]), digest);
         assert_eq!(
             digest.to_string(),
             "6437b3ac38465133ffb63b75273a8db548c558465d79db03fd359c6cd5bd9d85"

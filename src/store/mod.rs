@@ -19,6 +19,7 @@
 
 pub mod agreement;
 mod array_file;
+pub mod array_stream;
 pub mod catalog;
 pub mod check;
 mod codec;
@@ -35,7 +36,8 @@ pub mod quarantine;
 pub mod rows;
 pub mod snapshot;
 
-pub use array_file::write_description;
+pub use array_file::{DescriptionFile, write_description};
+pub use array_stream::ArrayStream;
 pub use catalog::{Catalog, Reader, Tx};
 pub use digest::{Digest, NotADigest};
 pub use error::StoreError;

@@ -6,10 +6,11 @@
 //! complete and never changes; where other bytes turn out to be needed under a name that is taken,
 //! they get a name of their own beside it, so that a row never speaks of bytes that were replaced.
 
+use super::array_file::DescriptionFile;
 use super::codec::decompress;
 use super::disk::Disk;
 use super::error::is_no_space;
-use super::mapped::{ArrayFileError, MappedDescription, write_description};
+use super::mapped::{ArrayFileError, MappedDescription};
 use super::rows::{ObjectKind, ObjectRow};
 use super::{Digest, Health, StoreError};
 use crate::pipeline::Description;
@@ -109,9 +110,10 @@ impl Objects {
         description: &Description,
         params_json: &str,
     ) -> Result<ObjectRow, StoreError> {
-        let bytes = write_description(description, params_json)?;
-        self.put(ObjectKind::Description, digest, &bytes, |stored| {
-            stored == bytes
+        let file = DescriptionFile::new(description, params_json)?;
+        let pieces = file.pieces();
+        self.put(ObjectKind::Description, digest, &pieces, |stored| {
+            holds(stored, &pieces)
         })
     }
 
@@ -121,7 +123,7 @@ impl Objects {
         let path = self.root.join(ObjectKind::Original.folder());
         let compressed =
             zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|e| StoreError::io(&path, e))?;
-        self.put(ObjectKind::Original, digest, &compressed, |stored| {
+        self.put(ObjectKind::Original, digest, &[&compressed], |stored| {
             decompress(stored, bytes.len()).is_ok_and(|stored| stored == bytes)
         })
     }
@@ -203,7 +205,7 @@ impl Objects {
         &self,
         kind: ObjectKind,
         digest: Digest,
-        bytes: &[u8],
+        pieces: &[&[u8]],
         same: impl Fn(&[u8]) -> bool,
     ) -> Result<ObjectRow, StoreError> {
         self.health.writable()?;
@@ -215,7 +217,7 @@ impl Objects {
             .unwrap_or_else(PoisonError::into_inner);
         self.make_folder(kind.folder(), &folder)?;
 
-        let blake3 = Digest::of(bytes);
+        let blake3 = Digest::of_pieces(pieces);
         let beside = &blake3.to_string()[..16];
         let names = [hex.clone(), format!("{hex}-{beside}")];
         for name in names {
@@ -240,12 +242,12 @@ impl Objects {
                 Err(e) if e.kind() == io::ErrorKind::NotFound => {}
                 Err(e) => return Err(StoreError::io(&path, e)),
             }
-            self.publish(&self.root.join(&folder), &path, bytes)?;
+            self.publish(&self.root.join(&folder), &path, pieces)?;
             return Ok(ObjectRow {
                 kind,
                 digest,
                 file,
-                length: bytes.len() as u64,
+                length: pieces.iter().map(|p| p.len() as u64).sum(),
                 blake3,
             });
         }
@@ -287,9 +289,9 @@ impl Objects {
     }
 
     /// Temporary file, sync, rename, sync of the folder.
-    fn publish(&self, folder: &Path, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+    fn publish(&self, folder: &Path, path: &Path, pieces: &[&[u8]]) -> Result<(), StoreError> {
         let (temporary, name) = self.temporary();
-        let written = self.write_synced(&temporary, bytes).and_then(|()| {
+        let written = self.write_synced(&temporary, pieces).and_then(|()| {
             self.disk
                 .rename(&temporary, path)
                 .map_err(|e| StoreError::io(path, e))
@@ -310,12 +312,14 @@ impl Objects {
         }
     }
 
-    fn write_synced(&self, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+    fn write_synced(&self, path: &Path, pieces: &[&[u8]]) -> Result<(), StoreError> {
         let mut file = self
             .disk
             .create(path)
             .map_err(|e| StoreError::io(path, e))?;
-        file.write_all(bytes).map_err(|e| StoreError::io(path, e))?;
+        for piece in pieces {
+            file.write_all(piece).map_err(|e| StoreError::io(path, e))?;
+        }
         file.sync().map_err(|e| self.sync_failed(path, &e))
     }
 
@@ -435,6 +439,16 @@ pub(super) fn relative(root: &Path, path: &Path) -> String {
         .unwrap_or(path)
         .display()
         .to_string()
+}
+
+/// Whether `stored` is what the pieces make.
+fn holds(mut stored: &[u8], pieces: &[&[u8]]) -> bool {
+    let all = pieces.iter().all(|piece| {
+        let rest = stored.strip_prefix(*piece);
+        stored = rest.unwrap_or_default();
+        rest.is_some()
+    });
+    all && stored.is_empty()
 }
 
 fn damaged(file: &str, message: impl ToString) -> StoreError {

@@ -27,3 +27,8 @@ for format in labels seg npy json ply obj glb usda; do
 done
 "$work/venv/bin/python" "$here/check.py" "$work/in" "$work/out"
 node "$work/validate.mjs" "$work"/out/*.glb
+
+# Every messy file through the socket, and spoilt ones with their reasons.
+if [ -n "${COSEG_TEST_DATA:-}" ] && [ -d "$COSEG_TEST_DATA/messy" ]; then
+    python3 "$here/messy.py" "$coseg" "$COSEG_TEST_DATA/messy" "$work/messy.md"
+fi

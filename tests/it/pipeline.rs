@@ -7,7 +7,7 @@ use coseg::library::{
 };
 use coseg::mesh::write::off;
 use coseg::mesh::{Format, TriMesh, parse};
-use coseg::pipeline::{Params, describe};
+use coseg::pipeline::{Params, describe, literal};
 use coseg::synth::{Family, Labelled, Options, family};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -266,6 +266,39 @@ fn the_number_of_parts_is_estimated_when_it_is_not_given() {
         score.n_predicted_labels
     );
     assert!(score.purity > 0.7, "purity {:.3}", score.purity);
+}
+
+#[test]
+fn an_estimated_up_axis_says_how_many_shapes_agree() {
+    let shapes = family(Family::Chair, 4, 3, &SMALL);
+    let (_folder, given) = library(4, Up::PlusY);
+    stream(&given, &shapes);
+    assert_eq!(given.collection(COLLECTION).unwrap().up_estimate, None);
+    let (_folder, library) = library(4, Up::Auto);
+    assert_eq!(library.collection(COLLECTION).unwrap().up_estimate, None);
+    stream(&library, &shapes);
+    let estimate = library.collection(COLLECTION).unwrap().up_estimate.unwrap();
+    assert_eq!(estimate.up, Up::PlusY);
+    assert!((0.5..=1.0).contains(&estimate.agreement), "{estimate:?}");
+}
+
+#[test]
+fn the_paper_taken_literally_gives_equal_shapes_equal_labels() {
+    let shapes = family(Family::Pliers, 2, 2, &SMALL);
+    let of = |s: &Labelled| {
+        let bytes = off(&s.mesh).into_bytes();
+        describe(&bytes, Format::Off, &Params::default(), &|_| true).unwrap()
+    };
+    let described = [of(&shapes[0]), of(&shapes[1]), of(&shapes[0])];
+    let views: Vec<_> = described.iter().map(|d| d.view()).collect();
+    let labels = literal(&views, 3, 1).unwrap();
+    assert_eq!(labels, literal(&views, 3, 1).unwrap());
+    assert_eq!(labels[0], labels[2]);
+    for (found, view) in labels.iter().zip(&views) {
+        assert_eq!(found.len(), view.faces.len());
+        assert!((0..3).all(|l| found.contains(&l)) && found.iter().all(|l| *l < 3));
+    }
+    assert_eq!(literal(&[], 3, 1).unwrap(), Vec::<Vec<u32>>::new());
 }
 
 #[test]

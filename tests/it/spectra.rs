@@ -6,8 +6,9 @@ mod convergence;
 mod dirty;
 mod reference;
 
-use coseg::operators::Laplacian;
-use coseg::spectrum::{Options, Spectrum, SpectrumError};
+use coseg::operators::{Laplacian, Operator, laplacian};
+use coseg::spectrum::{Options, Progress, Spectrum, SpectrumError};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// What the solver promises.
 const RESIDUAL: f64 = 1e-8;
@@ -51,4 +52,33 @@ fn check(operator: &Laplacian, eigenvalues: &[f64], columns: &[Vec<f64>]) {
             );
         }
     }
+}
+
+#[test]
+fn another_thread_stops_a_solve() {
+    let operator = laplacian(&dirty::drum(900, 2.0), &[], Operator::Tufted).unwrap();
+    let begun = AtomicBool::new(false);
+    let stop = AtomicBool::new(false);
+    let result = std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !begun.load(Ordering::Acquire) {
+                std::thread::yield_now();
+            }
+            stop.store(true, Ordering::Release);
+        });
+        let hook = |p: &Progress| {
+            begun.fetch_or(p.done > 0, Ordering::AcqRel);
+            // Never beyond half of the space, so that it is the flag that ends it.
+            while 2 * p.done > p.expected && !stop.load(Ordering::Acquire) {
+                std::thread::yield_now();
+            }
+            !stop.load(Ordering::Acquire)
+        };
+        let options = Options {
+            progress: Some(&hook),
+            ..Options::default()
+        };
+        Spectrum::smallest(&operator.stiffness, &operator.mass, 60, &options)
+    });
+    assert_eq!(result, Err(SpectrumError::Cancelled { stage: "iterate" }));
 }

@@ -98,6 +98,17 @@ if in_root setpriv --reuid nobody --regid nogroup --clear-groups \
 fi
 stop_service
 
+step "a stranger: the README's five lines, with the package in place of the first"
+sed -n '/^## Five lines to first labels$/,/^## [^F]/p' README.md | sed -n '/^```sh$/,/^```$/p' |
+    grep -v -e '^```' -e '^cargo install ' >"$root/lines"
+begin=$SECONDS
+in_root install -d -o nobody -g nogroup /stranger
+in_root setpriv --reuid nobody --regid nogroup --clear-groups env HOME=/stranger XDG_RUNTIME_DIR=/stranger NO_COLOR=1 \
+    bash -ec "trap 'kill \$(jobs -p); wait' EXIT; cd /stranger; $(cat "$root/lines")" >"$work/stranger.log" 2>&1 ||
+    { cat "$work/stranger.log" >&2; exit 1; }
+[ "$(find "$root/stranger/coloured" -name '*.glb' -size +50k | wc -l)" = 10 ]
+echo "ten GLB files in $((SECONDS - begin)) s"
+
 step "upgrade: data and an edited configuration are kept"
 echo '# edited' >>"$root/etc/coseg/coseg.toml"
 in_root dpkg -i --force-confold /new.deb >"$work/upgrade.log" 2>&1 || { cat "$work/upgrade.log" >&2; exit 1; }

@@ -2,9 +2,11 @@
 //
 //   node viewer.mjs empty URL OUT          a library without a collection
 //   node viewer.mjs all URL OUT FILE       everything, live and from a file; COSEG_BIN and COSEG_ENDPOINT are set
+//   node viewer.mjs many URL OUT FILE      how soon a collection of hundreds, `many`, appears; COSEG_VIEWER_MS is the limit
 
 import assert from "node:assert/strict";
 import { execFileSync } from "node:child_process";
+import { readdirSync, readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
 
@@ -75,7 +77,48 @@ async function mode(page, name, wanted) {
 const shot = (page, name) => page.screenshot({ path: `${out}/${name}.png` });
 const ready = (page) => page.$eval("html", (root) => ({ ...root.dataset }));
 
-if (what === "empty") {
+/** Seconds of processor time of the browser: of everything that this program started. */
+function processorTime() {
+  const of = new Map();
+  for (const pid of readdirSync("/proc").filter((name) => /^\d+$/.test(name))) {
+    try {
+      const fields = readFileSync(`/proc/${pid}/stat`, "latin1").replace(/^.*\) /s, "").split(" ");
+      of.set(Number(pid), { parent: Number(fields[1]), seconds: (Number(fields[11]) + Number(fields[12])) / 100 });
+    } catch {
+      // It ended meanwhile.
+    }
+  }
+  const own = (pid) => pid > 1 && (pid === process.pid || own(of.get(pid)?.parent ?? 0));
+  return [...of].filter(([pid]) => pid !== process.pid && own(pid)).reduce((sum, [, p]) => sum + p.seconds, 0);
+}
+
+if (what === "many") {
+  const limit = Number(process.env.COSEG_VIEWER_MS ?? 2000);
+  const n = coseg("ls", "--collection", "many").shapes.length;
+  for (const [kind, address] of [["live", `${url}#many`], ["file", pathToFileURL(file).href]]) {
+    await test(`${n} shapes appear in under ${limit} ms: ${kind}`, async () => {
+      const seen = [];
+      for (let round = 0; round < 3; round++) {
+        const before = processorTime();
+        const page = await open(address);
+        const used = processorTime() - before;
+        const { visibleMs, loadedMs } = await ready(page);
+        assert.equal(await page.$$eval(".card", (cards) => cards.length), n);
+        const drawn = await page.$$eval(".card canvas[data-drawn]", (cards) => cards.length);
+        assert.ok(drawn >= 24, `${drawn} pictures are drawn`);
+        console.log(`     ${drawn} pictures in sight after ${visibleMs} ms, all ${n} shapes read after ${loadedMs} ms; ${used.toFixed(1)} s of processor time`);
+        seen.push(Number(visibleMs));
+        if (round === 0) await shot(page, `many-${kind}`);
+        // One at the end of the list appears when it comes into sight.
+        await page.locator(".card").last().scrollIntoViewIfNeeded();
+        await page.waitForSelector(".card:last-child canvas[data-drawn]");
+        assert.deepEqual(page.faults, []);
+        await page.context().close();
+      }
+      assert.ok(Math.min(...seen) < limit, `the quickest of three took ${Math.min(...seen)} ms`);
+    });
+  }
+} else if (what === "empty") {
   await test("an empty library says what to do", async () => {
     const page = await open(url);
     assert.match(await page.textContent("#empty"), /coseg add/);

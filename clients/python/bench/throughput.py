@@ -87,6 +87,7 @@ def main() -> None:
     binary = str(Path(sys.argv[1]).resolve())
     env = {k: v for k, v in os.environ.items() if not k.startswith("COSEG_")}
     env |= {"COSEG__LIMITS__MEMORY": "8GiB", "COSEG__LIMITS__MAX_MESSAGE": "512MiB"}
+    env |= {"COSEG__LIMITS__MAX_BYTES_PER_CLIENT": "1GiB"}
     env |= {"COSEG__LIMITS__MAX_SHAPE": "256MiB", "COSEG__LOG__LEVEL": "error"}
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix="coseg") as folder:
@@ -100,7 +101,7 @@ def main() -> None:
         command = [binary, "serve", "--library", f"{folder}/library", "--endpoint", endpoint]
         daemon = subprocess.Popen(command, env=env)
         try:
-            with coseg.Library(endpoint, timeout=120) as lib:
+            with coseg.Library(endpoint) as lib:
                 collection = lib.collection("chairs", parts=4, up="+y")
                 paths = sorted(Path(folder, "m").glob("*.off"))
                 begin = time.perf_counter()

@@ -30,10 +30,16 @@ def environment() -> dict[str, str]:
 class Daemon:
     """A daemon in a folder of its own."""
 
-    def __init__(self, endpoint: str | None = None, settings: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        settings: dict[str, str] | None = None,
+        curve: coseg.Curve | None = None,
+    ) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="coseg"))
         self.endpoint = endpoint or f"ipc://{self.folder}/s"
         self.settings = settings or {}
+        self.curve = curve
         self.process: subprocess.Popen[bytes] | None = None
         self.start()
 
@@ -41,7 +47,7 @@ class Daemon:
         command = [BINARY, "serve", "--library", f"{self.folder}/library", "--endpoint", self.endpoint]
         with open(self.folder / "log", "ab") as log:
             self.process = subprocess.Popen(command, stderr=log, env={**environment(), **self.settings})
-        with coseg.Library(self.endpoint, timeout=30) as lib:
+        with coseg.Library(self.endpoint, timeout=30, curve=self.curve) as lib:
             lib.hello()
 
     def kill(self) -> None:

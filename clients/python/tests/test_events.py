@@ -6,7 +6,6 @@ import threading
 from pathlib import Path
 
 import pytest
-import zmq
 from conftest import Daemon
 
 import coseg
@@ -124,42 +123,3 @@ def test_patience_ends(daemon: Daemon) -> None:
         daemon.kill()
         with pytest.raises(coseg.NoAnswer):
             next(events)
-
-
-def test_encrypted_sockets_are_used_when_keys_are_given() -> None:
-    """A stand-in for the daemon that takes only clients with the right keys."""
-    from coseg.v1 import daemon_pb2, message_pb2
-
-    public, secret = zmq.curve_keypair()
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    router = context.socket(zmq.ROUTER)
-    router.curve_server = True
-    router.curve_secretkey = secret
-    port = router.bind_to_random_port("tcp://127.0.0.1")
-
-    over = threading.Event()
-
-    def serve() -> None:
-        while not over.is_set():
-            if not router.poll(100):
-                continue
-            peer, header = router.recv_multipart()
-            request = message_pb2.Request.FromString(header)
-            reply = message_pb2.Reply(request_id=request.request_id)
-            reply.hello.CopyFrom(daemon_pb2.HelloReply(version="curve", instance="1"))
-            router.send_multipart([peer, reply.SerializeToString()])
-
-    server = threading.Thread(target=serve, daemon=True)
-    server.start()
-    endpoint = f"tcp://127.0.0.1:{port}"
-    keys = coseg.Curve.ephemeral(public.decode())
-    with coseg.Library(endpoint, curve=keys, timeout=3) as lib:
-        assert lib.hello().version == "curve"
-    with coseg.Library(endpoint, timeout=1) as plain, pytest.raises(coseg.NoAnswer):
-        plain.hello()
-    wrong = coseg.Curve.ephemeral(zmq.curve_keypair()[0].decode())
-    with coseg.Library(endpoint, curve=wrong, timeout=1) as lib, pytest.raises(coseg.NoAnswer):
-        lib.hello()
-    over.set()
-    server.join()
-    context.destroy(linger=0)

@@ -107,6 +107,17 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     pulled = target.eigenvectors[:, :k2].T @ (target.mass[:, None] * fmap.carry(phi[:, :k1]))
     assert np.abs(pulled - fmap.c_12).max() < 0.05
     assert fmap.quality.coverage > 0
+    assert fmap.quality.expected_error is None
+    # One for points, and what it carries: constants, and labels as good as those that are there.
+    dense = chairs.library.map(a, b, "chairs", points=True)
+    assert dense.p2p_21.shape == (n_b,) and 0 < (dense.quality.expected_error or 0) < 1
+    pinned = chairs.map(a, b, landmarks=[(int(dense.p2p_21[0]), 0)])
+    assert pinned.quality.expected_error is not None
+    n_faces = len(chairs.labels(a)), len(chairs.labels(b))
+    ones = chairs.transfer(np.ones((n_faces[0], 2)), a, b)
+    assert ones.shape == (n_faces[1], 2) and np.allclose(ones, 1)
+    voted = chairs.transfer(chairs.labels(a), a, b)
+    assert voted.dtype == np.int32 and (voted == chairs.labels(b)).mean() > 0.5
     matches = chairs.match_parts(a, b)
     assert matches.matches and matches.matches[0].overlap > 0
     nearest = chairs.nearest(a, limit=2)

@@ -12,5 +12,5 @@
 export type { Item } from "./batch.js";
 export * from "./errors.js";
 export * from "./library.js";
-export type { Curve } from "./transport.js";
+export { curveFromEnv, curveFromFiles, type Curve } from "./transport.js";
 export type { Arrays, Encoded, Matrix, Mesh, Plain } from "./wire.js";

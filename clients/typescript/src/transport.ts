@@ -1,5 +1,6 @@
 /** ZeroMQ sockets around {@link Link}. */
 
+import { readFileSync } from "node:fs";
 import { Dealer, Subscriber } from "zeromq";
 import { CosegError } from "./errors.js";
 import type { Reply } from "./gen/coseg/v1/message_pb.js";
@@ -10,6 +11,30 @@ export interface Curve {
   readonly server: string;
   readonly public: string;
   readonly secret: string;
+}
+
+/** The keys that `coseg keys generate` made: the daemon's `server.pub` and this client's `NAME.key`. */
+export function curveFromFiles(server: string, client: string): Curve {
+  return { server: key(server, "public"), public: key(client, "public"), secret: key(client, "secret") };
+}
+
+/** The keys of the files that `$COSEG_SERVER_KEY` and `$COSEG_CLIENT_KEY` name; undefined where neither is set. */
+export function curveFromEnv(): Curve | undefined {
+  const { COSEG_SERVER_KEY: server, COSEG_CLIENT_KEY: client } = process.env;
+  if (!server && !client) return undefined;
+  if (!server || !client) {
+    const missing = server ? "COSEG_CLIENT_KEY" : "COSEG_SERVER_KEY";
+    throw new CosegError(`an encrypted connection needs both keys: ${missing} is not set`);
+  }
+  return curveFromFiles(server, client);
+}
+
+function key(path: string, kind: string): string {
+  for (const line of readFileSync(path, "latin1").split("\n")) {
+    const [found, value, ...more] = line.trim().split(/\s+/);
+    if (found === kind && value?.length === 40 && more.length === 0) return value;
+  }
+  throw new CosegError(`${path} has no ${kind} key of 40 characters; \`coseg keys generate\` makes such files`);
 }
 
 /** A reply and its raw frames. */

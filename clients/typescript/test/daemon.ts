@@ -5,7 +5,7 @@ import { once } from "node:events";
 import { mkdtempSync, readdirSync, readFileSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
-import { Library } from "../src/index.js";
+import { Library, type Curve } from "../src/index.js";
 
 const binary = process.env.COSEG_BIN;
 if (binary === undefined) throw new Error("COSEG_BIN names the daemon's binary");
@@ -19,16 +19,22 @@ export class Daemon {
   readonly endpoint = `ipc://${this.folder}/s`;
   #process: ChildProcess | undefined;
 
-  static async started(): Promise<Daemon> {
-    const daemon = new Daemon();
+  /** `settings` are variables of its environment, `curve` the keys to reach it with. */
+  constructor(
+    readonly settings: Record<string, string> = {},
+    readonly curve?: Curve,
+  ) {}
+
+  static async started(settings: Record<string, string> = {}, curve?: Curve): Promise<Daemon> {
+    const daemon = new Daemon(settings, curve);
     await daemon.start();
     return daemon;
   }
 
   async start(): Promise<void> {
     const args = ["serve", "--library", `${this.folder}/library`, "--endpoint", this.endpoint];
-    this.#process = spawn(binary!, args, { env, stdio: "ignore" });
-    const lib = new Library({ endpoint: this.endpoint });
+    this.#process = spawn(binary!, args, { env: { ...env, ...this.settings }, stdio: "ignore" });
+    const lib = new Library({ endpoint: this.endpoint, ...(this.curve && { curve: this.curve }) });
     await lib.hello();
     lib.close();
   }
@@ -58,6 +64,11 @@ export function chairs(count: number): string[] {
   execFileSync(binary!, args, { env, stdio: "ignore" });
   const names = readdirSync(folder).filter((name) => name.endsWith(".off"));
   return names.sort().map((name) => join(folder, name));
+}
+
+/** Runs `coseg keys` on a folder. */
+export function keys(folder: string, ...args: string[]): void {
+  execFileSync(binary!, ["keys", "--dir", folder, ...args], { env, stdio: "ignore" });
 }
 
 /** Coordinates and corners of an OFF file of triangles. */

@@ -90,6 +90,11 @@ test("spectra and maps are arrays", async () => {
   assert.equal(map.c12.data.length, map.c12.shape[0]! * map.c12.shape[1]!);
   assert.ok(map.p2p21.every((v) => v < n!));
   assert.ok(map.quality.coverage > 0);
+  const dense = await lib.map(a, b, "chairs", { landmarks: [[map.p2p21[0]!, 0]] });
+  assert.ok(dense.quality.expectedError! > 0 && map.quality.expectedError === undefined);
+  const ones = await chairs.transfer(new Float32Array((await chairs.labels(a)).length).fill(1), a, b);
+  assert.ok(ones.length === (await chairs.labels(b)).length && ones.every((v) => Math.abs(v - 1) < 1e-5));
+  assert.ok((await chairs.transfer(await chairs.labels(a), a, b)) instanceof Int32Array);
   assert.ok((await chairs.matchParts(a, b)).matches.length > 0);
   assert.equal((await chairs.nearest(a, 2)).length, 2);
   const maps = await Promise.all(names.slice(1, 4).map((to) => chairs.map(a, to)));

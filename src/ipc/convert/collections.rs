@@ -152,6 +152,10 @@ pub fn collection(info: &CollectionInfo) -> wire::Collection {
         n_shapes: info.n_shapes,
         n_stale: info.n_stale,
         labels: info.labels.iter().map(label_info).collect(),
+        up_estimate: info.up_estimate.map(|e| wire::UpEstimate {
+            up: up_to_wire(e.up).into(),
+            agreement: e.agreement,
+        }),
     }
 }
 

@@ -54,6 +54,7 @@ pub fn corrected(c: &Corrected) -> wire::CorrectLabelsReply {
         area_share: c.area_share,
         changed_share: c.changed_share,
         n_stale: c.n_stale,
+        job_id: c.job,
     }
 }
 

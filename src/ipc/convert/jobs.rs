@@ -3,7 +3,7 @@
 use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, error::Subject, shape_input};
-use crate::library::{ItemState, JobItem, NewShape, Outcome, Placed};
+use crate::library::{Carrying, ItemState, Job, JobItem, NewShape, Outcome, Placed};
 use crate::mesh::Format;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -17,6 +17,28 @@ pub struct Ingest<'a> {
     pub max_shape_bytes: u64,
     /// Reads a file that a request names by path, if that is allowed.
     pub read_path: &'a dyn Fn(&Path) -> Result<Vec<u8>, wire::Error>,
+}
+
+/// A job in which a correction is carried.
+pub fn carrying_job(job: &Job, carrying: &Carrying) -> wire::Job {
+    let finished = carrying.n_left == 0;
+    wire::Job {
+        job_id: job.id,
+        collection: job.collection.clone(),
+        items: Vec::new(),
+        // A finished job changes no more.
+        revision: if finished {
+            u64::MAX
+        } else {
+            1 + carrying.n_shapes - carrying.n_left
+        },
+        finished,
+        progress: carrying.progress(),
+        carrying: Some(wire::Carrying {
+            n_shapes: carrying.n_shapes,
+            n_left: carrying.n_left,
+        }),
+    }
 }
 
 /// A format on the wire.

@@ -18,5 +18,7 @@ pub use errors::{
     error, failure, field_error, frame_error, library_error, library_failure, with_subject,
 };
 pub use events::event;
-pub use jobs::{Ingest, add_shapes, format_from_wire, item, job_finished, mesh_format, new_shapes};
+pub use jobs::{
+    Ingest, add_shapes, carrying_job, format_from_wire, item, job_finished, mesh_format, new_shapes,
+};
 pub use shapes::{labels, labels_snapshot, original, shape};

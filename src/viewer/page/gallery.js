@@ -1,7 +1,10 @@
 // All shapes in the colours of their labels, drawn when they come into sight.
 
-/** Milliseconds of a frame that drawing small pictures may take. */
-const BUDGET_MS = 30;
+/**
+ * Milliseconds of a frame that drawing small pictures may take. Without a graphics card a frame costs far more than the
+ * pictures in it, so there should be few.
+ */
+const BUDGET_MS = 150;
 /** Pictures that are drawn at once, in rows of so many. */
 const COLUMNS = 4;
 const $ = (id) => document.getElementById(id);

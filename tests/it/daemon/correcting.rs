@@ -82,6 +82,45 @@ fn worst(found: &BTreeMap<String, Vec<i32>>, but: &str) -> f64 {
 }
 
 #[test]
+fn a_correction_is_a_job_with_progress() {
+    let home = Home::new();
+    let (_daemon, mut client) = stocked(&home, 5);
+    let done = correct(&mut client, "s1", &truth());
+    let (mut progress, mut revision) = (Vec::new(), 0);
+    let job = loop {
+        let request = wire::WatchJobRequest {
+            job_id: done.job_id,
+            revision,
+            wait_ms: 10_000,
+        };
+        let job = call!(client, WatchJob(request)).unwrap().job.unwrap();
+        progress.push(job.progress);
+        if job.finished {
+            break job;
+        }
+        revision = job.revision;
+    };
+    assert!(progress.is_sorted() && job.progress == 1.0, "{progress:?}");
+    let all = wire::Carrying {
+        n_shapes: 4,
+        n_left: 0,
+    };
+    assert_eq!((job.items.len(), job.carrying), (0, Some(all)));
+    assert_eq!(worst(&snapshot(&mut client), "s1"), {
+        wait_idle(&mut client, "c");
+        worst(&snapshot(&mut client), "s1")
+    });
+
+    let next = correct(&mut client, "s3", &truth());
+    assert!(next.job_id > done.job_id);
+    let first = wire::GetJobRequest {
+        job_id: done.job_id,
+    };
+    let first = call!(client, GetJob(first)).unwrap().job.unwrap();
+    assert!(first.finished && first.carrying == Some(wire::Carrying::default()));
+}
+
+#[test]
 fn a_correction_changes_the_others_survives_a_restart_and_is_undone() {
     let home = Home::new();
     let (daemon, mut client) = stocked(&home, 6);

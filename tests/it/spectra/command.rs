@@ -56,7 +56,49 @@ fn the_file_holds_the_operator_and_its_pairs() {
         let values = doubles(&file, "eigenvalues");
         check(&Laplacian { stiffness, mass }, &values, &columns);
         assert_eq!(values[k - 1], found["eigenvalues"][k - 1].as_f64().unwrap());
+        assert_eq!(found["certificate"]["proved"], true, "{found}");
+        assert_signatures(&file, &values, &columns);
     }
+}
+
+/// Signatures are those of the formulas, whatever batches and kernels they were computed in.
+fn assert_signatures(file: &SafeTensors<'_>, values: &[f64], columns: &[Vec<f64>]) {
+    let (n, k) = (columns[0].len(), values.len());
+    let times = coseg::descriptors::hks_times(values, 100);
+    let hks = doubles(file, "hks");
+    let weights = coseg::descriptors::wave_weights(values, 100);
+    let wks = doubles(file, "wks");
+    let gps = doubles(file, "gps");
+    assert_eq!(gps.len(), n * (k - 1));
+    for v in (0..n).step_by(17) {
+        for j in [0, 1, 50, 98, 99] {
+            let heat = |i: usize| (-values[i] * times[j]).exp() * columns[i][v].powi(2);
+            let expected: f64 = (0..k).map(heat).sum();
+            let found = hks[v * 100 + j];
+            assert!(
+                (found - expected).abs() <= 1e-12 * expected,
+                "hks {v} {j}: {found} {expected}"
+            );
+            let wave = |i: usize| weights[(i, j)] * columns[i][v].powi(2);
+            let expected: f64 = (0..k).map(wave).sum();
+            let found = wks[v * 100 + j];
+            assert!(
+                (found - expected).abs() <= 1e-12 * expected,
+                "wks {v} {j}: {found} {expected}"
+            );
+        }
+        for i in 1..k {
+            let (found, expected) = (gps[v * (k - 1) + i - 1], columns[i][v] / values[i].sqrt());
+            assert!(
+                (found - expected).abs() <= 1e-12 * expected.abs(),
+                "gps {v} {i}"
+            );
+        }
+    }
+    let dna = file.tensor("shape_dna").unwrap();
+    assert_eq!(dna.shape(), [k - 1]);
+    let (first, _) = dna.data().split_first_chunk::<4>().unwrap();
+    assert_eq!(f32::from_le_bytes(*first), values[1].ln() as f32);
 }
 
 #[test]

@@ -6,9 +6,12 @@ import os
 import re
 import uuid
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import zmq
+
+from coseg.errors import CosegError
 
 
 @dataclass(frozen=True)
@@ -22,16 +25,39 @@ class Curve:
     secret: str
 
     @staticmethod
-    def ephemeral(server: str) -> Curve:
-        """A new pair, for a daemon that lets any client in that knows its key."""
-        public, secret = zmq.curve_keypair()
-        return Curve(server, public.decode(), secret.decode())
+    def from_files(server: str | os.PathLike[str], client: str | os.PathLike[str]) -> Curve:
+        """The keys that ``coseg keys generate`` made: the daemon's ``server.pub`` and this client's
+        ``NAME.key``."""
+        return Curve(_key(server, "public"), _key(client, "public"), _key(client, "secret"))
+
+    @staticmethod
+    def from_env() -> Curve | None:
+        """The keys of the files that ``$COSEG_SERVER_KEY`` and ``$COSEG_CLIENT_KEY`` name, as the command
+        line takes them; ``None`` where neither is set."""
+        server, client = os.environ.get("COSEG_SERVER_KEY"), os.environ.get("COSEG_CLIENT_KEY")
+        if not server and not client:
+            return None
+        if not server or not client:
+            missing = "COSEG_CLIENT_KEY" if server else "COSEG_SERVER_KEY"
+            raise CosegError(f"an encrypted connection needs both keys: {missing} is not set")
+        return Curve.from_files(server, client)
 
     def apply(self, socket: zmq.Socket[Any]) -> None:
         """Sets the keys on a socket that is not yet connected."""
         socket.curve_serverkey = self.server.encode()
         socket.curve_publickey = self.public.encode()
         socket.curve_secretkey = self.secret.encode()
+
+
+def _key(path: str | os.PathLike[str], kind: str) -> str:
+    """The key of a kind in a file of lines `KIND KEY`."""
+    for line in Path(path).read_text(encoding="ascii").splitlines():
+        match line.split():
+            case [found, key] if found == kind and len(key) == 40:
+                return key
+    raise CosegError(
+        f"{os.fspath(path)} has no {kind} key of 40 characters; `coseg keys generate` makes such files"
+    )
 
 
 def default_endpoint() -> str:

@@ -309,18 +309,24 @@ def descriptors(reply: analysis_pb2.GetDescriptorsReply, raw: Raw) -> t.Descript
     return t.Descriptors(**{f.name: raw.array(getattr(reply, f.name)) for f in fields(t.Descriptors)})
 
 
+def map_quality(message: analysis_pb2.MapQuality) -> t.MapQuality:
+    """How good a map is."""
+    expected = message.expected_error if message.HasField("expected_error") else None
+    return flat(t.MapQuality, message, expected_error=expected)
+
+
 def functional_map(
     source: str, target: str, reply: analysis_pb2.GetFunctionalMapReply, raw: Raw
 ) -> t.FunctionalMap:
     """A functional map."""
-    quality = flat(t.MapQuality, reply.quality)
+    quality = map_quality(reply.quality)
     return t.FunctionalMap(source, target, raw.array(reply.c_12), raw.array(reply.p2p_21), quality)
 
 
 def part_matches(reply: analysis_pb2.GetPartCorrespondenceReply) -> t.PartMatches:
     """Matching parts."""
     matches = tuple(flat(t.PartMatch, m) for m in reply.matches)
-    return t.PartMatches(matches, flat(t.MapQuality, reply.quality))
+    return t.PartMatches(matches, map_quality(reply.quality))
 
 
 def event(message: event_pb2.Event) -> t.Event:

@@ -238,6 +238,9 @@ class MapQuality:
     coverage: float
     #: Share of the entries of C with magnitude below 0.1.
     near_zero: float
+    #: Of maps between points: the mean geodesic error to expect, in units of the square root of the area,
+    #: with a reflection of the whole forgiven.
+    expected_error: float | None = None
 
 
 @dataclass(frozen=True)

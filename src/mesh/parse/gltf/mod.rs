@@ -43,8 +43,11 @@ fn fault(place: impl ToString, why: impl ToString) -> ParseError {
     }
 }
 
-/// The JSON and the binary chunk of a file of either kind.
-fn container(bytes: &[u8]) -> Result<(Cow<'_, [u8]>, Option<Cow<'_, [u8]>>), ParseError> {
+/// The JSON and the binary chunk of a file.
+type Chunks<'a> = (Cow<'a, [u8]>, Option<Cow<'a, [u8]>>);
+
+/// The chunks of a file of either kind.
+fn container(bytes: &[u8]) -> Result<Chunks<'_>, ParseError> {
     if bytes.starts_with(b"glTF") {
         // The crate subtracts the length of the header from that of the file.
         let length = bytes.get(8..12).and_then(|word| word.try_into().ok());
