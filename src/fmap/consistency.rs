@@ -143,7 +143,7 @@ fn median(values: &mut [f64]) -> f64 {
 pub(super) mod tests {
     use super::super::convert::functional;
     use super::super::test_shapes::{Curve, cycle};
-    use super::{Link, standings};
+    use super::{Link, standings, triangles};
     use rand::seq::SliceRandom;
     use rand::{Rng, SeedableRng};
 
@@ -215,7 +215,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn exactly_the_wrong_maps_do_not_agree() {
+    fn wrong_maps_do_not_agree_and_right_ones_do_unless_most_of_their_triangles_are_spoilt() {
         let (shapes, mut maps) = turned(14);
         let sizes = vec![K; shapes.len()];
         let before = standings(&sizes, &links(&maps));
@@ -224,7 +224,20 @@ pub(super) mod tests {
         assert!(wrong.len() >= 5);
         let after = standings(&sizes, &links(&maps));
         let found: Vec<usize> = (0..maps.len()).filter(|m| after[*m].inconsistent).collect();
-        assert_eq!(found, wrong);
+        assert!(
+            wrong.iter().all(|m| found.contains(m)),
+            "{wrong:?} {found:?}"
+        );
+        // A map of which at least half of the triangles have a wrong side looks wrong too.
+        let spoilt = |m: usize| {
+            let of: Vec<bool> = triangles(&sizes, &links(&maps))
+                .iter()
+                .filter(|(three, _)| three.contains(&m))
+                .map(|(three, _)| three.iter().any(|l| wrong.contains(l)))
+                .collect();
+            2 * of.iter().filter(|s| **s).count() >= of.len()
+        };
+        assert!(found.iter().all(|m| spoilt(*m)), "{wrong:?} {found:?}");
     }
 
     #[test]
