@@ -209,6 +209,17 @@ mod tests {
         "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
 
     /// Two libraries over one folder stand for two processes.
+    /// Without times, which lose their last bit on the way through JSON.
+    fn untimed(state: ItemState) -> ItemState {
+        match state {
+            ItemState::Done(mut placed) => {
+                placed.stages_ms.clear();
+                ItemState::Done(placed)
+            }
+            other => other,
+        }
+    }
+
     #[test]
     fn what_is_placed_beside_is_what_the_holder_would_have_placed() {
         let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
@@ -246,7 +257,8 @@ mod tests {
                 .unwrap();
             let state = state.unwrap();
             assert!(matches!(state, ItemState::Done(_)), "{state:?}");
-            assert_eq!(holders[0].item_state(&first.0.items[0]).unwrap(), state);
+            let stored = holders[0].item_state(&first.0.items[0]).unwrap();
+            assert_eq!(untimed(stored), untimed(state));
             holders[1]
                 .place_item(&second.0.items[0], Ok(second.1))
                 .unwrap();

@@ -1,7 +1,7 @@
 //! Shapes come in: labelled, refused, cancelled, repeated.
 
 use super::{add_again, create, describe, events_since, raw, raw_error, wait_idle};
-use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, refusal, skittle};
+use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, skittle};
 use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::frames::FrameReader;
