@@ -44,7 +44,7 @@ INSTEAD = {
     "127.0.0.1:8640": ("127.0.0.1:{viewer}", "the port may be taken on this machine"),
     "tcp://0.0.0.0:7421": ("tcp://0.0.0.0:{daemon}", "the port may be taken on this machine"),
     "tcp://host:7421": ("tcp://127.0.0.1:{daemon}", "`host` stands for the reader's"),
-    "--data DIR [--category NAME] [--orders 3] [--up +y] [--estimate]": (
+    "--data DIR [--category NAME] [--orders 3] [--exemplars 0,1,3,5] [--up +y] [--estimate]": (
         "--data benchmark --orders 1 --up +y --estimate --no-baselines",
         "a synopsis; on four made chairs",
     ),
