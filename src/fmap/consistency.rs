@@ -31,6 +31,21 @@ pub struct Link<'a> {
     pub weight: f64,
 }
 
+/// A map with the numbers of the shapes that it leads from and to: `c_12 (k_to, k_from)`, row-major.
+pub type Numbered = (usize, usize, Vec<f32>);
+
+/// Maps as links that are believed alike.
+pub fn links(maps: &[Numbered]) -> Vec<Link<'_>> {
+    maps.iter()
+        .map(|(from, to, c_12)| Link {
+            from: *from,
+            to: *to,
+            c_12,
+            weight: 1.0,
+        })
+        .collect()
+}
+
 impl Link<'_> {
     /// The map as a matrix, given the sizes of all shapes.
     pub(super) fn matrix(&self, sizes: &[usize]) -> DMatrix<f64> {
@@ -143,16 +158,13 @@ fn median(values: &mut [f64]) -> f64 {
 pub(super) mod tests {
     use super::super::convert::functional;
     use super::super::test_shapes::{Curve, cycle};
-    use super::{Link, standings, triangles};
+    use super::{Numbered, links, standings, triangles};
     use rand::seq::SliceRandom;
     use rand::{Rng, SeedableRng};
 
     /// Eigenfunctions of each shape.
     pub(in super::super) const K: usize = 11;
     const N: usize = 120;
-
-    /// From, to, and the map.
-    pub(in super::super) type Numbered = (usize, usize, Vec<f32>);
 
     /// Closed curves that are turned against each other, with maps from each to the next few that send every vertex to one
     /// near the right one.
@@ -201,17 +213,6 @@ pub(super) mod tests {
             maps[*at].2 = functional(&shapes[i].basis(), &shapes[j].basis(), &p2p, K, K);
         }
         wrong
-    }
-
-    pub(in super::super) fn links(maps: &[Numbered]) -> Vec<Link<'_>> {
-        maps.iter()
-            .map(|(from, to, c_12)| Link {
-                from: *from,
-                to: *to,
-                c_12,
-                weight: 1.0,
-            })
-            .collect()
     }
 
     #[test]

@@ -182,8 +182,8 @@ fn weighted_gram(block: &DMatrix<f64>, eigenvalues: &[f64]) -> DMatrix<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::consistency::Link;
-    use super::super::consistency::tests::{K, links, spoil, turned};
+    use super::super::consistency::tests::{K, spoil, turned};
+    use super::super::consistency::{Link, links};
     use super::super::convert::{functional, pointwise};
     use super::LatentBasis;
 

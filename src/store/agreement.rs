@@ -3,7 +3,7 @@
 use super::catalog::Reader;
 use super::error::StoreError;
 use super::rows::{CollectionId, ShapeId};
-use crate::fmap::consistency::{Link, Standing, leading, standings};
+use crate::fmap::consistency::{Link, Numbered, Standing, leading, links, standings};
 
 /// Rows and columns by which maps are compared; maps are less alike the finer they are.
 const K_COMPARED: u32 = 20;
@@ -16,7 +16,7 @@ pub struct KeptMaps {
     /// Rows and columns of each block.
     pub k: usize,
     /// From, to (positions in `shapes`), and the block, row-major.
-    pub maps: Vec<(usize, usize, Vec<f32>)>,
+    pub maps: Vec<Numbered>,
 }
 
 impl KeptMaps {
@@ -45,15 +45,7 @@ impl KeptMaps {
 
     /// The maps as links of equal weight.
     pub fn links(&self) -> Vec<Link<'_>> {
-        self.maps
-            .iter()
-            .map(|(from, to, c_12)| Link {
-                from: *from,
-                to: *to,
-                c_12,
-                weight: 1.0,
-            })
-            .collect()
+        links(&self.maps)
     }
 
     /// How each of them agrees with the others.
