@@ -72,25 +72,23 @@ impl Store {
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         create_library_folder(dir)?;
         let lock = LibraryLock::acquire(dir)?;
-        let health = Health::default();
-        // Before the objects' folders, so that their sync of `dir` covers the catalog's name.
-        let catalog = Catalog::open(&catalog::path_in(dir), health.clone())?;
-        let disk: Arc<dyn Disk> = Arc::new(RealDisk);
-        let objects = Objects::open(disk, dir, health.clone())?;
-        Ok(Self {
-            objects,
-            catalog,
-            health,
-            dir: dir.to_path_buf(),
-            lock: Some(lock),
-        })
+        Self::open_with(Catalog::open, dir, Some(lock))
     }
 
     /// Opens the library in `dir`, which another process holds, to change what that process lets this one change. It must
     /// be there, in the current format.
     pub fn open_beside(dir: &Path) -> Result<Self, StoreError> {
+        Self::open_with(Catalog::open_beside, dir, None)
+    }
+
+    fn open_with(
+        open_catalog: fn(&Path, Health) -> Result<Catalog, StoreError>,
+        dir: &Path,
+        lock: Option<LibraryLock>,
+    ) -> Result<Self, StoreError> {
         let health = Health::default();
-        let catalog = Catalog::open_beside(&catalog::path_in(dir), health.clone())?;
+        // Before the objects' folders, so that their sync of `dir` covers the catalog's name.
+        let catalog = open_catalog(&catalog::path_in(dir), health.clone())?;
         let disk: Arc<dyn Disk> = Arc::new(RealDisk);
         let objects = Objects::open(disk, dir, health.clone())?;
         Ok(Self {
@@ -98,7 +96,7 @@ impl Store {
             catalog,
             health,
             dir: dir.to_path_buf(),
-            lock: None,
+            lock,
         })
     }
 
