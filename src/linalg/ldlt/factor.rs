@@ -185,6 +185,25 @@ fn solve<S: Simd, const X: usize, const C: usize>(simd: S, factor: &Factor, x: &
     }
 }
 
+/// Rows of a block's entries, `W` each.
+type Entries<'a, const W: usize> = &'a [[f64; W]];
+
+impl Block {
+    /// The unit triangle, the rows of the same supernode, the further rows, and which these are.
+    #[inline(always)]
+    fn entries<'a, const W: usize>(
+        &self,
+        factor: &'a Factor,
+    ) -> (Entries<'a, W>, Entries<'a, W>, Entries<'a, W>, &'a [u32]) {
+        let rows = &factor.rows[self.rows.0..self.rows.1];
+        let n_entries = W * (W + self.n_local + rows.len());
+        let (l, _) = factor.values[self.value..self.value + n_entries].as_chunks::<W>();
+        let (triangle, below) = l.split_at(W);
+        let (local, further) = below.split_at(self.n_local);
+        (triangle, local, further, rows)
+    }
+}
+
 #[inline(always)]
 fn forward<S: Simd, const X: usize, const W: usize, const C: usize>(
     simd: S,
@@ -192,11 +211,7 @@ fn forward<S: Simd, const X: usize, const W: usize, const C: usize>(
     block: &Block,
     x: &mut [[f64; C]],
 ) {
-    let rows = &factor.rows[block.rows.0..block.rows.1];
-    let n_entries = W * (W + block.n_local + rows.len());
-    let (l, _) = factor.values[block.value..block.value + n_entries].as_chunks::<W>();
-    let (triangle, below) = l.split_at(W);
-    let (local, further) = below.split_at(block.n_local);
+    let (triangle, local, further, rows) = block.entries::<W>(factor);
     let end = block.column + W;
     for h in 0..C / (X * S::F64_LANES) {
         let mut a = [[simd.splat_f64s(0.0); X]; W];
@@ -236,11 +251,7 @@ fn backward<S: Simd, const X: usize, const W: usize, const C: usize>(
     block: &Block,
     x: &mut [[f64; C]],
 ) {
-    let rows = &factor.rows[block.rows.0..block.rows.1];
-    let n_entries = W * (W + block.n_local + rows.len());
-    let (l, _) = factor.values[block.value..block.value + n_entries].as_chunks::<W>();
-    let (triangle, below) = l.split_at(W);
-    let (local, further) = below.split_at(block.n_local);
+    let (triangle, local, further, rows) = block.entries::<W>(factor);
     let end = block.column + W;
     let inverse_pivots = &factor.inverse_pivots[block.column..end];
     for h in 0..C / (X * S::F64_LANES) {
