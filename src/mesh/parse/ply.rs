@@ -165,10 +165,10 @@ fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
 
 impl Body<'_> {
     /// The next row; `None` when it is not there as a whole.
-    fn row(&mut self, element: &ElementDef) -> Result<Option<Row>, ParseError> {
+    fn row(&mut self, element: &ElementDef, index: usize) -> Result<Option<Row>, ParseError> {
         let parser = Parser::<Row>::new();
         let row = match self.encoding {
-            Encoding::Ascii => return self.text_row(element),
+            Encoding::Ascii => return self.text_row(element, index),
             Encoding::BinaryBigEndian => parser.read_big_endian_element(&mut self.rest, element),
             Encoding::BinaryLittleEndian => {
                 parser.read_little_endian_element(&mut self.rest, element)
@@ -184,7 +184,7 @@ impl Body<'_> {
     }
 
     /// The next line of a text that is not empty.
-    fn text_row(&mut self, element: &ElementDef) -> Result<Option<Row>, ParseError> {
+    fn text_row(&mut self, element: &ElementDef, index: usize) -> Result<Option<Row>, ParseError> {
         let mut row = Row::default();
         if element.properties.is_empty() {
             return Ok(Some(row));
@@ -217,6 +217,9 @@ impl Body<'_> {
                 }
                 PropertyType::List(..) => {
                     let n: usize = number(self.line, next()?)?;
+                    if is_corners(name) {
+                        check_corners(index, n)?;
+                    }
                     for _ in 0..n {
                         let word = next()?;
                         if is_corners(name) {
@@ -313,17 +316,21 @@ fn check(header: &Header) -> Result<(), ParseError> {
     Ok(())
 }
 
+/// Refuses a face with fewer corners than one or more than are read.
+fn check_corners(face: usize, n: usize) -> Result<(), ParseError> {
+    match n {
+        0 => Err(ParseError::EmptyPolygon { face }),
+        1..=MAX_CORNERS => Ok(()),
+        _ => Err(ParseError::PolygonTooLarge {
+            face,
+            corners: n as u64,
+        }),
+    }
+}
+
 /// A face's corners, all of them vertices.
 fn corners(row: &Row, face: usize, n_vertices: usize) -> Result<Vec<u32>, ParseError> {
-    if row.corners.is_empty() {
-        return Err(ParseError::EmptyPolygon { face });
-    }
-    if row.corners.len() > MAX_CORNERS {
-        return Err(ParseError::PolygonTooLarge {
-            face,
-            corners: row.corners.len() as u64,
-        });
-    }
+    check_corners(face, row.corners.len())?;
     let inside = |&vertex: &i64| match u32::try_from(vertex) {
         Ok(index) if (index as usize) < n_vertices => Ok(index),
         _ => Err(ParseError::VertexOutOfRange {
@@ -345,7 +352,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
             polygons.mesh.vertices.reserve_exact(element.count);
         }
         for index in 0..element.count {
-            let Some(row) = body.row(element)? else {
+            let Some(row) = body.row(element, index)? else {
                 return Err(ParseError::Truncated {
                     what: rows_are(element),
                     declared: element.count as u64,

@@ -169,7 +169,7 @@ fn ply_errors_name_the_place_and_the_value() {
         ),
         (
             with("3 0 1 2", "20000 0 1 2"),
-            "line 13 ends before all 1 properties of its row are given",
+            "face 0 has 20000 corners, but at most 10000 are read",
         ),
         (
             with("1 0 0\n", "1 0 nan\n"),
