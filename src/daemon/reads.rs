@@ -113,7 +113,12 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
         }
         Body::GetFunctionalMap(r) => {
             let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
-            Reply::GetFunctionalMap(convert::functional_map(&map, &mut frames))
+            let mut reply = convert::functional_map(&map, &mut frames);
+            if r.agreement {
+                let standing = library.standing(&r.collection, &r.from, &r.to, &map);
+                reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
+            }
+            Reply::GetFunctionalMap(reply)
         }
         Body::GetPartCorrespondence(r) => {
             let (matches, quality) = library
@@ -281,6 +286,7 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
         workers: daemon.n_workers as u32,
         n_placed: daemon.metrics.n_placed(),
         n_relabelled: daemon.metrics.relabelled.get(),
+        n_inconsistent_maps: daemon.metrics.inconsistent.get(),
         n_events: daemon.metrics.events.get(),
         received_bytes: daemon.metrics.received_bytes.get(),
         sent_bytes: daemon.metrics.sent_bytes.get(),
