@@ -2,10 +2,12 @@
 //!
 //! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts what
 //! arrives into reads (side by side), changes (one after the other, in order of arrival) and waits;
-//! [`work`] describes and [`placing`] places accepted shapes; [`publish`] sends what the event log gained.
+//! [`work`] describes and [`placing`] places accepted shapes, [`asked`] answers what needs computing, all three in
+//! processes of their own ([`worker`]); [`publish`] sends what the event log gained.
 //! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
 
 mod access;
+mod asked;
 mod fair;
 mod http;
 mod memory;
@@ -138,6 +140,8 @@ struct Daemon {
     work: Work,
     /// A permit for each shape that may be placed at a time.
     placing: Arc<Semaphore>,
+    /// A permit for each change of labels that may be carried out at a time.
+    changing: Semaphore,
     drain: watch::Sender<bool>,
     /// A client asked for the drain.
     asked_to_drain: std::sync::mpsc::Sender<service::Control>,
@@ -227,6 +231,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         pool,
         library,
         placing: Arc::new(Semaphore::new(n_workers)),
+        changing: Semaphore::new(n_workers),
         endpoint: bound.endpoint.clone(),
         events: bound.events.clone(),
         instance: instance(),

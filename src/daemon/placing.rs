@@ -6,7 +6,8 @@
 
 use crate::daemon::publish::Notice;
 use crate::daemon::work::{
-    MAX_ATTEMPTS, Outcome, Prepared, Step, cancelled, died, failed, note_death, prepare, too_long,
+    MAX_ATTEMPTS, Outcome, Prepared, Step, cancelled, died_each_time, failed, note_death, prepare,
+    too_long,
 };
 use crate::daemon::worker::{self, Ended, Placing, panicked};
 use crate::daemon::{Daemon, blocking};
@@ -215,7 +216,7 @@ fn try_to_place(
         match note_death(daemon, item, &text)? {
             // It was done, or cancelled, before the worker ended.
             0 => return Ok(Ok(())),
-            n if n >= MAX_ATTEMPTS => return Ok(Err(died(&text, out_of_memory, n))),
+            n if n >= MAX_ATTEMPTS => return Ok(Err(died_each_time(&text, out_of_memory, n))),
             _ => {}
         }
     }

@@ -1,25 +1,21 @@
-//! Requests that change nothing, answered from the library.
+//! Requests that change nothing, answered from what is stored: rows are read, arrays are copied, nothing is computed from
+//! shapes.
 
 use crate::daemon::metrics::Now;
-use crate::daemon::requests::{Answer, MAX_WAIT_MS};
+use crate::daemon::requests::MAX_WAIT_MS;
 use crate::daemon::sockets::{MAX_FRAMES, MAX_HEADER_BYTES, MAX_ID_CHARS};
 use crate::daemon::{Daemon, requests};
-use crate::ipc::frames::{FrameReader, FrameWriter};
-use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body};
+use crate::ipc::frames::FrameWriter;
+use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
-use crate::library::{JobFilter, LibraryError};
+use crate::library::{JobFilter, Library, LibraryError, MapInfo};
 use crate::mesh::Format;
-use crate::viewer::{Pack, PortraitError, portrait};
 use bytes::Bytes;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 /// Entries of a page.
 const MAX_PAGE: u32 = 1_000;
-/// Neighbours when the request does not say how many.
-const DEFAULT_NEIGHBORS: u32 = 5;
-/// Shapes of one GetPortraits.
-const MAX_PORTRAITS: usize = 256;
 /// What this version knows beyond the names of its requests.
 const CAPABILITIES: [&str; 6] = [
     "add_shapes.create",
@@ -30,8 +26,17 @@ const CAPABILITIES: [&str; 6] = [
     "events",
 ];
 
-/// Answers one request that came with these raw frames.
-pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer {
+/// What is known of a request that changes nothing.
+#[allow(clippy::large_enum_variant)] // returned once, never in a collection
+pub(crate) enum Looked {
+    /// Its answer, as it is stored.
+    Up((Reply, Vec<Bytes>)),
+    /// Its answer is to be computed from shapes, which this process does not do.
+    ToCompute(Body),
+}
+
+/// Answers one request from what is stored.
+pub(crate) fn look_up(daemon: &Arc<Daemon>, body: Body) -> Result<Looked, wire::Error> {
     let library = &daemon.library;
     let mut frames = FrameWriter::default();
     let result = match body {
@@ -96,48 +101,15 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
                 .map_err(refuse)?;
             Reply::GetDescriptors(convert::descriptors(&description.view(), &mut frames))
         }
-        Body::GetFunctionalMap(r) if r.points.is_some() => {
-            let asked = convert::point_request(&r.points.unwrap_or_default());
-            let maps = library
-                .point_maps(&r.collection, &r.from, &r.to, &asked)
-                .map_err(refuse)?;
-            Reply::GetFunctionalMap(convert::point_maps(&maps, &mut frames))
-        }
-        Body::TransferFunction(r) => {
-            let values = convert::polygon_values(r.values.as_ref(), FrameReader::new(sent))?;
-            let asked = convert::point_request(&r.points.unwrap_or_default());
-            let (carried, map) = library
-                .transfer(&r.collection, &r.from, &r.to, &values, &asked)
-                .map_err(refuse)?;
-            Reply::TransferFunction(convert::transferred(&carried, &map, &mut frames))
-        }
-        Body::GetFunctionalMap(r) => {
-            let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
-            let mut reply = convert::functional_map(&map, &mut frames);
-            if r.agreement {
-                let standing = library.standing(&r.collection, &r.from, &r.to, &map);
-                reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
-            }
-            Reply::GetFunctionalMap(reply)
-        }
-        Body::GetPartCorrespondence(r) => {
-            let (matches, quality) = library
-                .part_correspondence(&r.collection, &r.shape_a, &r.shape_b)
-                .map_err(refuse)?;
-            Reply::GetPartCorrespondence(convert::part_correspondence(&matches, &quality))
-        }
-        Body::Nearest(r) => {
-            let limit = page("limit", r.limit, DEFAULT_NEIGHBORS)?;
-            let nearest = library
-                .nearest(&r.collection, &r.shape, limit)
-                .map_err(refuse)?;
-            Reply::Nearest(convert::nearest(nearest))
-        }
-        Body::GetPortraits(r) => Reply::GetPortraits(portraits(daemon, &r, &mut frames)?),
-        Body::SuggestNext(r) => {
-            let suggestion = library.suggest(&r.collection).map_err(refuse)?;
-            Reply::SuggestNext(convert::suggested(&suggestion))
-        }
+        Body::GetFunctionalMap(r) => match kept_map(library, &r, &mut frames)? {
+            Some(reply) => Reply::GetFunctionalMap(reply),
+            None => return Ok(Looked::ToCompute(Body::GetFunctionalMap(r))),
+        },
+        computed @ (Body::TransferFunction(_)
+        | Body::GetPartCorrespondence(_)
+        | Body::Nearest(_)
+        | Body::GetPortraits(_)
+        | Body::SuggestNext(_)) => return Ok(Looked::ToCompute(computed)),
         Body::EventsSince(r) => Reply::EventsSince(events_since(daemon, &r)?),
         Body::CreateCollection(_)
         | Body::DeleteCollection(_)
@@ -154,7 +126,42 @@ pub(crate) fn answer(daemon: &Arc<Daemon>, body: Body, sent: &[Bytes]) -> Answer
         | Body::WatchJob(_)
         | Body::WaitIdle(_) => unreachable!("invariant: dispatch sends only reads here"),
     };
-    Ok((result, frames.finish()))
+    Ok(Looked::Up((result, frames.finish())))
+}
+
+/// The map that is asked for, if it is kept.
+fn kept_map(
+    library: &Library,
+    r: &wire::GetFunctionalMapRequest,
+    frames: &mut FrameWriter,
+) -> Result<Option<wire::GetFunctionalMapReply>, wire::Error> {
+    let (collection, from, to) = (&r.collection, &r.from, &r.to);
+    Ok(match &r.points {
+        Some(points) => library
+            .kept_point_maps(collection, from, to, &convert::point_request(points))
+            .map_err(refuse)?
+            .map(|maps| convert::point_maps(&maps, frames)),
+        None => library
+            .kept_map(collection, from, to)
+            .map_err(refuse)?
+            .map(|map| map_reply(library, r, &map, frames))
+            .transpose()?,
+    })
+}
+
+/// What is told of a map for parts.
+pub(crate) fn map_reply(
+    library: &Library,
+    r: &wire::GetFunctionalMapRequest,
+    map: &MapInfo,
+    frames: &mut FrameWriter,
+) -> Result<wire::GetFunctionalMapReply, wire::Error> {
+    let mut reply = convert::functional_map(map, frames);
+    if r.agreement {
+        let standing = library.standing(&r.collection, &r.from, &r.to, map);
+        reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
+    }
+    Ok(reply)
 }
 
 fn refuse(e: LibraryError) -> wire::Error {
@@ -162,7 +169,7 @@ fn refuse(e: LibraryError) -> wire::Error {
 }
 
 /// The number of entries asked for, or `default` if 0.
-fn page(field: &str, asked: u32, default: u32) -> Result<usize, wire::Error> {
+pub(crate) fn page(field: &str, asked: u32, default: u32) -> Result<usize, wire::Error> {
     if asked > MAX_PAGE {
         let text = format!("{field} is {asked}, the limit is {MAX_PAGE}");
         return Err(convert::field_error(ErrorReason::FieldRange, field, text));
@@ -328,61 +335,6 @@ pub(crate) fn not_ready(daemon: &Daemon) -> Option<String> {
     }
     let stopped = daemon.library.store().health().read_only();
     stopped.map(|(since, cause)| format!("the store refuses writes since {since}: {cause}"))
-}
-
-fn undrawable(e: &PortraitError) -> wire::Error {
-    let (code, reason) = match e {
-        PortraitError::TooLarge { .. } => {
-            (ErrorCode::FailedPrecondition, ErrorReason::MeshTooLarge)
-        }
-        PortraitError::Unreadable { .. } => (ErrorCode::DataLoss, ErrorReason::Damaged),
-    };
-    convert::error(code, reason, e.to_string())
-}
-
-/// Shapes in the form that the viewer draws.
-fn portraits(
-    daemon: &Daemon,
-    r: &wire::GetPortraitsRequest,
-    frames: &mut FrameWriter,
-) -> Result<wire::GetPortraitsReply, wire::Error> {
-    let found = r.shapes.len();
-    if found > MAX_PORTRAITS {
-        let text = format!("{found} shapes are asked for, the limit is {MAX_PORTRAITS}");
-        return Err(convert::field_error(
-            ErrorReason::FieldRange,
-            "shapes",
-            text,
-        ));
-    }
-    let library = &daemon.library;
-    let mut pack = Pack::default();
-    let mut shapes = Vec::new();
-    for name in &r.shapes {
-        shapes.push(match r.detail() {
-            wire::PortraitDetail::Unspecified | wire::PortraitDetail::Proxy => {
-                let (mapped, labels, version) = library
-                    .labelled_proxy(&r.collection, name)
-                    .map_err(refuse)?;
-                portrait::proxy(&mut pack, name, version, &mapped.view(), &labels)
-            }
-            wire::PortraitDetail::Functions => {
-                let mapped = library.description(&r.collection, name).map_err(refuse)?;
-                portrait::functions(&mut pack, name, &mapped.view())
-            }
-            wire::PortraitDetail::Surface => {
-                let (bytes, format) = library.original(&r.collection, name).map_err(refuse)?;
-                let labels = library.labels(&r.collection, name, None).map_err(refuse)?;
-                let of = (bytes.as_slice(), format);
-                portrait::surface(&mut pack, name, labels.version, of, &labels.labels)
-                    .map_err(|e| undrawable(&e))?
-            }
-        });
-    }
-    let pack = pack.finish(&serde_json::json!({ "shapes": shapes }));
-    Ok(wire::GetPortraitsReply {
-        pack: Some(frames.file(pack)),
-    })
 }
 
 /// Resident memory of this process as the kernel counts it; 0 if it does not say.

@@ -1,10 +1,11 @@
 //! Requests are sorted by what they need: reads run side by side, changes of one collection one after the
-//! other, what is taken in likewise, waits hold no thread. Where requests queue up, clients take turns.
+//! other, what is taken in likewise, waits hold no thread. Where requests queue up, clients take turns; what is to be
+//! computed queues up apart from what is only looked up.
 
 use crate::daemon::fair::{Gate, Turn};
 use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
-use crate::daemon::{Daemon, blocking, reads, writes};
+use crate::daemon::{Daemon, asked, blocking, reads, writes};
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
 use crate::library::Job;
@@ -38,6 +39,7 @@ pub(crate) struct InHand {
 pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<Incoming>) {
     // What queues up at the gates is bounded by the permits.
     let readers = Gate::new(daemon.n_workers + EXTRA_READS);
+    let computing = Gate::new(daemon.n_workers);
     let intake = Gate::new(1);
     let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
@@ -59,6 +61,13 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
         let in_hand = InHand { incoming, permit };
         let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
+        // At once: what is refused keeps nobody waiting for what is taken in.
+        if let Body::AddShapes(r) = &body
+            && let Err(full) = writes::look_for_room(&daemon, r.shapes.len())
+        {
+            in_hand.finish(&daemon, Err(full));
+            continue;
+        }
         // Changes of labels may wait while a lane learns; nothing else waits with them.
         let gate = changed_collection(&body).map(|name| {
             if collections.len() >= MAX_GATES {
@@ -115,17 +124,36 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
                 let turn = readers.queue(&client);
+                let computing = Arc::clone(&computing);
                 let mut in_hand = in_hand;
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
-                    let _pass = turn.come().await;
-                    blocking(&d, move |d| reads::answer(d, body, &frames))
-                        .await
-                        .unwrap_or_else(panicked)
+                    let pass = turn.come().await;
+                    let looked = blocking(&d, move |d| reads::look_up(d, body)).await;
+                    drop(pass);
+                    match looked.unwrap_or_else(|panic| Err(panic_error(&panic)))? {
+                        reads::Looked::Up(answer) => Ok(answer),
+                        reads::Looked::ToCompute(body) => {
+                            let _pass = computing.queue(&client).come().await;
+                            asked::read(&d, body, frames).await
+                        }
+                    }
                 }));
             }
         }
     }
+}
+
+/// How far a request was when its deadline passed.
+enum Late {
+    /// It changes nothing.
+    Over,
+    /// It was to change something, and will not.
+    NotBegun,
+    /// What it changes goes on.
+    GoesOn,
+    /// It was accepted: this job goes on.
+    Accepted(u64),
 }
 
 /// The collection whose labels, or existence, a request changes.
@@ -145,10 +173,10 @@ fn changed_collection(body: &Body) -> Option<&str> {
 /// Carries out a change when its turn comes.
 async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, turn: Turn) {
     let Some(pass) = in_hand.by_deadline(turn.come()).await else {
-        return in_hand.late(&daemon, None);
+        return in_hand.late(&daemon, Late::NotBegun);
     };
     if in_hand.is_late() {
-        return in_hand.late(&daemon, None);
+        return in_hand.late(&daemon, Late::NotBegun);
     }
     let key = writes::key(&in_hand.incoming.request);
     let frames = std::mem::take(&mut in_hand.incoming.frames);
@@ -166,8 +194,8 @@ async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, tu
         done
     });
     let Some(done) = in_hand.by_deadline(&mut done).await else {
-        // It goes on and keeps its turn; the same request id, asked again, tells what came of it.
-        return in_hand.late(&daemon, None);
+        // It keeps its turn.
+        return in_hand.late(&daemon, Late::GoesOn);
     };
     let done = done.unwrap_or_else(|e| Err(e.to_string()));
     in_hand.incoming.ticket.free_bytes();
@@ -185,7 +213,7 @@ async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, tu
             let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
             match placed {
                 Some(answer) => in_hand.finish(&daemon, answer),
-                None => in_hand.late(&daemon, Some(job)),
+                None => in_hand.late(&daemon, Late::Accepted(job)),
             }
         }
         Err(error) => in_hand.finish(&daemon, Err(error)),
@@ -212,7 +240,7 @@ impl InHand {
     ) {
         match self.by_deadline(work(Arc::clone(&daemon))).await {
             Some(answer) => self.finish(&daemon, answer),
-            None => self.late(&daemon, None),
+            None => self.late(&daemon, Late::Over),
         }
     }
 
@@ -238,14 +266,28 @@ impl InHand {
         }
     }
 
-    fn late(self, daemon: &Daemon, job: Option<u64>) {
+    fn late(self, daemon: &Daemon, how_far: Late) {
         let ms = self.incoming.request.deadline_ms;
+        let has_key = writes::key(&self.incoming.request).is_some();
+        let rest = match how_far {
+            Late::Over => String::new(),
+            Late::NotBegun => "; it was not begun".to_owned(),
+            Late::Accepted(job) => format!("; job {job} goes on"),
+            Late::GoesOn if has_key => {
+                "; the change goes on, and the same request, sent again with \
+                its request_id, tells what came of it"
+                    .to_owned()
+            }
+            Late::GoesOn => "; the change goes on".to_owned(),
+        };
         let mut error = convert::error(
             ErrorCode::DeadlineExceeded,
             ErrorReason::Deadline,
-            format!("no answer within the request's {ms} ms"),
+            format!("no answer within the request's {ms} ms{rest}"),
         );
-        error.subject = job.map(Subject::JobId);
+        if let Late::Accepted(job) = how_far {
+            error.subject = Some(Subject::JobId(job));
+        }
         self.finish(daemon, Err(error));
     }
 }
@@ -325,7 +367,7 @@ fn panic_error(panic: &str) -> wire::Error {
     )
 }
 
-fn panicked(panic: String) -> Answer {
+pub(crate) fn panicked(panic: String) -> Answer {
     Err(panic_error(&panic))
 }
 

@@ -277,7 +277,7 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
             let attempts =
                 note_death(daemon, item, &text).map_err(|e| convert::library_failure(&e))?;
             if attempts >= MAX_ATTEMPTS {
-                return Err(died(&text, out_of_memory, attempts));
+                return Err(died_each_time(&text, out_of_memory, attempts));
             }
             if !wanted() {
                 return Err(cancelled());
@@ -312,7 +312,14 @@ pub(super) fn note_death(daemon: &Daemon, item: &JobItem, text: &str) -> Result<
     Ok(attempts)
 }
 
-pub(super) fn died(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
+/// The failure of a shape whose last attempt ended its worker too.
+pub(super) fn died_each_time(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
+    let what = format!("the work on this shape ended its process {attempts} times, the last time");
+    died(&what, text, out_of_memory)
+}
+
+/// The failure of work that ended its worker.
+pub(super) fn died(what: &str, text: &str, out_of_memory: bool) -> Failure {
     let reason = if out_of_memory {
         "SHAPE_MEMORY"
     } else {
@@ -323,9 +330,7 @@ pub(super) fn died(text: &str, out_of_memory: bool, attempts: u32) -> Failure {
     } else {
         "INTERNAL"
     };
-    let message =
-        format!("the work on this shape ended its process {attempts} times, the last time: {text}");
-    failed(code, reason, message)
+    failed(code, reason, format!("{what}: {text}"))
 }
 
 /// Bytes that a description holds until it is placed.

@@ -1,10 +1,10 @@
 //! Requests that change something, carried out one after the other.
 
 use crate::config;
-use crate::daemon::Daemon;
 use crate::daemon::progress::Waiting;
 use crate::daemon::publish::Notice;
 use crate::daemon::requests::draining;
+use crate::daemon::{Daemon, asked};
 use crate::ipc::convert;
 use crate::ipc::endpoint::Endpoint;
 use crate::ipc::frames::FrameReader;
@@ -86,44 +86,11 @@ pub(crate) fn change(
                 label: Some(convert::label_info(&label)),
             })
         }
-        Body::CorrectLabels(r) => {
-            let correction = convert::correction(r, FrameReader::new(frames))?;
-            let done = library
-                .correct(&r.collection, &r.shape, &correction, key)
-                .map_err(refuse)?;
-            daemon.labels_changed(&r.collection);
-            Reply::CorrectLabels(convert::corrected(&done))
-        }
-        Body::MergeLabels(r) => {
-            let (label, n_shapes) = library
-                .merge_labels(&r.collection, r.label, r.into, key)
-                .map_err(refuse)?;
-            daemon.labels_changed(&r.collection);
-            let label = Some(convert::label_info(&label));
-            Reply::MergeLabels(wire::MergeLabelsReply { label, n_shapes })
-        }
-        Body::SplitLabel(r) => {
-            let (label, n_shapes) = library
-                .split_label(&r.collection, r.label, key)
-                .map_err(refuse)?;
-            daemon.labels_changed(&r.collection);
-            let label = Some(convert::label_info(&label));
-            Reply::SplitLabel(wire::SplitLabelReply { label, n_shapes })
-        }
-        Body::Undo(r) => {
-            let undone = library.undo(&r.collection, key).map_err(refuse)?;
-            daemon.labels_changed(&r.collection);
-            Reply::Undo(convert::undone(&undone))
-        }
-        Body::RemoveShape(r) => {
-            library
-                .remove(&r.collection, &r.shape, key)
-                .map_err(refuse)?;
-            daemon.notice(Notice::Changed(r.collection.clone()));
-            // Those that carried its labels over may be stale now.
-            daemon.nudge(&r.collection);
-            Reply::RemoveShape(wire::RemoveShapeReply {})
-        }
+        Body::CorrectLabels(_)
+        | Body::MergeLabels(_)
+        | Body::SplitLabel(_)
+        | Body::Undo(_)
+        | Body::RemoveShape(_) => asked::change(daemon, body, frames, key)?,
         Body::CancelJob(r) => {
             let job = library.cancel(r.job_id).map_err(refuse)?;
             daemon.forget_cancelled(&job);
@@ -149,14 +116,6 @@ pub(crate) fn change(
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
     };
     Ok(Done::Now(Box::new(reply)))
-}
-
-impl Daemon {
-    /// A person changed labels: what happened is published, and what follows begins.
-    fn labels_changed(self: &Arc<Self>, collection: &str) {
-        self.notice(Notice::Changed(collection.to_owned()));
-        self.nudge(collection);
-    }
 }
 
 fn refuse(e: LibraryError) -> wire::Error {
@@ -210,6 +169,15 @@ fn add_shapes(
     }
 }
 
+/// Refuses so many shapes for which the queue has no room whatever their size.
+pub(crate) fn look_for_room(daemon: &Daemon, n_shapes: usize) -> Result<(), wire::Error> {
+    // Where nothing is taken in, that is the reason to tell.
+    if daemon.is_draining() {
+        return Ok(());
+    }
+    admit(daemon, &vec![0; n_shapes])
+}
+
 /// Refuses shapes for which the queue has no room: by number, by bytes, and by the time that placing all of
 /// them is estimated to take.
 fn admit(daemon: &Daemon, n_bytes: &[u64]) -> Result<(), wire::Error> {
@@ -244,12 +212,21 @@ fn admit(daemon: &Daemon, n_bytes: &[u64]) -> Result<(), wire::Error> {
             let mut error = convert::error(code, ErrorReason::QueueFull, text);
             // Until as much is done as there is too much of.
             let wait = load.seconds() * (queued + asked - limit) / queued.max(1.0);
-            error.retry_after_ms = ((wait * 1e3) as u64).clamp(QUEUE_RETRY_MS.0, QUEUE_RETRY_MS.1);
-            daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+            let n_refused = daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+            error.retry_after_ms = spread_out(wait * 1e3, n_refused);
             return Err(error);
         }
     }
     Ok(())
+}
+
+/// Milliseconds to be told to the `n`th who is refused: up to twice as many, evenly, so that those who were refused at the
+/// same moment do not come back at the same moment.
+fn spread_out(wait_ms: f64, n: u64) -> u64 {
+    // The fraction of n times the golden ratio.
+    let share = n.wrapping_mul(0x9E37_79B9_7F4A_7C15) as f64 / 2.0_f64.powi(64);
+    let wait_ms = wait_ms.clamp(QUEUE_RETRY_MS.0 as f64, QUEUE_RETRY_MS.1 as f64);
+    ((wait_ms * (1.0 + share)) as u64).min(QUEUE_RETRY_MS.1)
 }
 
 /// Creates the collection if it is missing, or compares it with what the request states.
@@ -335,4 +312,20 @@ fn read_allowed(
         .read_to_end(&mut bytes)
         .map_err(io)?;
     Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{QUEUE_RETRY_MS, spread_out};
+
+    #[test]
+    fn those_who_are_refused_together_come_back_one_after_the_other() {
+        let mut told: Vec<u64> = (0..64).map(|n| spread_out(0.0, n)).collect();
+        told.sort_unstable();
+        assert!(told[0] >= QUEUE_RETRY_MS.0 && told[63] < 2 * QUEUE_RETRY_MS.0);
+        let gaps = told.windows(2).map(|w| w[1] - w[0]);
+        assert!(gaps.clone().max() <= Some(8), "{told:?}");
+        assert!(gaps.clone().filter(|gap| *gap == 0).count() < 4, "{told:?}");
+        assert_eq!(spread_out(f64::INFINITY, 1), QUEUE_RETRY_MS.1);
+    }
 }

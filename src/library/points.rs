@@ -48,16 +48,12 @@ impl Library {
         to: &str,
         request: &PointRequest,
     ) -> Result<Vec<PointMap>> {
+        if let Some(kept) = self.kept_point_maps(collection, from, to, request)? {
+            return Ok(kept);
+        }
         let (_, a) = self.shape_row(collection, from)?;
         let (_, b) = self.shape_row(collection, to)?;
         let key = request_key(request);
-        let kept = self
-            .store
-            .catalog()
-            .read(|r| r.point_maps(a.id, b.id, &key).map_err(LibraryError::from))?;
-        if !kept.is_empty() {
-            return kept.into_iter().map(from_row).collect();
-        }
         let (one, two) = (self.known(a.id)?.mapped, self.known(b.id)?.mapped);
         let found = maps(&one.view(), &two.view(), request)?;
         let rows: Vec<PointMapRow> = found.iter().map(to_row).collect();
@@ -70,6 +66,29 @@ impl Library {
             Err(LibraryError::Store(e)) if e.is_damage() => Err(e.into()),
             _ => rows.into_iter().map(from_row).collect(),
         }
+    }
+
+    /// What [`Library::point_maps`] gives if it is kept: nothing is computed.
+    ///
+    /// # Errors
+    /// There is no such shape, or the map is damaged.
+    pub fn kept_point_maps(
+        &self,
+        collection: &str,
+        from: &str,
+        to: &str,
+        request: &PointRequest,
+    ) -> Result<Option<Vec<PointMap>>> {
+        let (_, a) = self.shape_row(collection, from)?;
+        let (_, b) = self.shape_row(collection, to)?;
+        let key = request_key(request);
+        let kept = self
+            .store
+            .catalog()
+            .read(|r| r.point_maps(a.id, b.id, &key).map_err(LibraryError::from))?;
+        let kept = Some(kept).filter(|k| !k.is_empty());
+        kept.map(|k| k.into_iter().map(from_row).collect())
+            .transpose()
     }
 
     /// Values at the polygons of `from` become values at those of `to`, by the map between their points: of labels the

@@ -76,6 +76,14 @@ impl Library {
         Ok((self.original_bytes(&row.content_digest)?, format))
     }
 
+    /// Bytes of the file of a shape, for whoever plans its memory.
+    ///
+    /// # Errors
+    /// There is no such shape, or the catalog cannot be read.
+    pub fn original_length(&self, collection: &str, shape: &str) -> Result<u64> {
+        self.object_length(&self.shape_row(collection, shape)?.1.content_digest)
+    }
+
     /// Eigenvalues, eigenvectors, HKS, descriptors of a shape: mapped, not copied.
     ///
     /// # Errors
@@ -109,25 +117,11 @@ impl Library {
     /// # Errors
     /// There is no such shape, or the collection has no label model yet.
     pub fn map(&self, collection: &str, from: &str, to: &str) -> Result<MapInfo> {
+        if let Some(kept) = self.kept_map(collection, from, to)? {
+            return Ok(kept);
+        }
         let (_, a) = self.shape_row(collection, from)?;
         let (row, b) = self.shape_row(collection, to)?;
-        let kept = self
-            .store
-            .catalog()
-            .read(|r| r.map(a.id, b.id).map_err(LibraryError::from))?;
-        if let Some(m) = kept {
-            let quality = quality_from_json(&m.quality_json, &format!("maps {from} {to}"))?;
-            let confidence = confidence_of_row(&m)?;
-            let (k1, k2) = (m.k1 as usize, m.k2 as usize);
-            return Ok(MapInfo {
-                c_12: m.c_12,
-                k2,
-                k1,
-                p2p_21: m.p2p_21,
-                confidence,
-                quality,
-            });
-        }
         let model = self.with_lane(row, |lane| {
             Ok(lane.learnt.as_ref().map(|l| l.model.clone()))
         })?;
@@ -149,6 +143,31 @@ impl Library {
             confidence: found.confidence,
             quality: found.quality,
         })
+    }
+
+    /// What [`Library::map`] gives if it is kept: nothing is computed.
+    ///
+    /// # Errors
+    /// There is no such shape, or the map is damaged.
+    pub fn kept_map(&self, collection: &str, from: &str, to: &str) -> Result<Option<MapInfo>> {
+        let (_, a) = self.shape_row(collection, from)?;
+        let (_, b) = self.shape_row(collection, to)?;
+        let kept = self
+            .store
+            .catalog()
+            .read(|r| r.map(a.id, b.id).map_err(LibraryError::from))?;
+        let Some(m) = kept else { return Ok(None) };
+        let quality = quality_from_json(&m.quality_json, &format!("maps {from} {to}"))?;
+        let confidence = confidence_of_row(&m)?;
+        let (k1, k2) = (m.k1 as usize, m.k2 as usize);
+        Ok(Some(MapInfo {
+            c_12: m.c_12,
+            k2,
+            k1,
+            p2p_21: m.p2p_21,
+            confidence,
+            quality,
+        }))
     }
 
     /// Which part of A matches which part of B under the map from A to B, by descending overlap, and how good the

@@ -8,7 +8,7 @@ use crate::segmentation::patches;
 use crate::spectrum::{self, Eigenpairs, Progress, SpectrumError};
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
-pub const ALGORITHM_VERSION: u32 = 3;
+pub const ALGORITHM_VERSION: u32 = 4;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.

@@ -19,7 +19,7 @@ fault(
     (
         "        let (temporary, name) = self.temporary();\n        let written",
         """        if FAULT {
-            let (path, bytes) = (path.to_path_buf(), bytes.to_vec());
+            let (path, bytes) = (path.to_path_buf(), pieces.concat());
             std::thread::spawn(move || {
                 std::thread::sleep(Duration::from_millis(50));
                 std::fs::write(path, bytes)
@@ -240,8 +240,8 @@ fault(
     "R10", "r10-no-delay", "refuse without a delay",
     "src/daemon/writes.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
     (
-        "            error.retry_after_ms = ((wait * 1e3)",
-        "            error.retry_after_ms = if FAULT { 0 } else { 1 } * ((wait * 1e3)",
+        "            error.retry_after_ms = spread_out(",
+        "            error.retry_after_ms = if FAULT { 0 } else { 1 } * spread_out(",
     ),
 )
 fault(
@@ -261,6 +261,11 @@ fault(
     "R10", "r10-first-come", "serve one client to the end before the next",
     "src/daemon/fair.rs", "lib daemon::fair::tests::clients_take_turns_and_each_keeps_its_order",
     ("                state.turns.push_back(client);\n            }\n            let Some(next)", "                if FAULT {\n                    state.turns.push_front(client);\n                } else {\n                    state.turns.push_back(client);\n                }\n            }\n            let Some(next)"),
+)
+fault(
+    "R10", "r10-going-on-untold", "say of a change that goes on that it was not begun",
+    "src/daemon/requests.rs", "it daemon::answering::a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again",
+    ("        return in_hand.late(&daemon, Late::GoesOn);", "        return in_hand.late(&daemon, if FAULT { Late::NotBegun } else { Late::GoesOn });"),
 )
 # R11: isolation
 fault(
@@ -293,6 +298,24 @@ fault(
         "        Ok(described) => described,\n",
         "        Ok(described) if FAULT => {\n            // As it would be there.\n            if item.name.starts_with(\"abort\") {\n                std::process::abort();\n            }\n            return library.place_item(item, Ok(described));\n        }\n        Ok(described) => described,\n",
     ),
+)
+fault(
+    "R11", "r11-answered-in-the-daemon", "answer what computes in the daemon itself",
+    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    (
+        "    let config = daemon.config();\n    let limit",
+        "    if FAULT && subjects(body).1.contains(&\"abort\") {\n        // As it would be there.\n        std::process::abort();\n    }\n    let config = daemon.config();\n    let limit",
+    ),
+)
+fault(
+    "R11", "r11-answered-for-ever", "let the answer to a request take for ever",
+    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    ("    let in_time = || begin.elapsed() < limit && wanted();", "    let in_time = || (begin.elapsed() < limit || FAULT) && wanted();"),
+)
+fault(
+    "R11", "r11-answered-for-nobody", "go on with an answer that nobody waits for any more",
+    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    ("waiting.strong_count() > 0", "waiting.strong_count() > 0 || FAULT"),
 )
 # R12: clocks
 fault(

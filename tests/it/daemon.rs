@@ -1,6 +1,7 @@
 //! The daemon over its real sockets.
 
 mod adding;
+mod answering;
 mod correcting;
 mod isolation;
 mod life;

@@ -1,12 +1,18 @@
 //! What a worker does: the same program in its other role.
 
-use super::{MEMORY_MARGIN, OUTCOME, READY, STAGE, read_bytes};
+use super::{
+    MEMORY_MARGIN, OUTCOME, READY, STAGE, answers, joined, read_bytes, subjects, taken_apart,
+};
 use crate::daemon::panic_text;
+use crate::daemon::requests::Answer;
 use crate::ipc::convert;
+use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply};
 use crate::library::isolate::{self, DescribeJob};
 use crate::library::{Failure, ItemState, LibraryError};
 use crate::store::StoreError;
 use crate::{Library, library};
+use bytes::Bytes;
+use prost::Message as _;
 use rustix::process::{Resource, Rlimit, getrlimit, nice, setrlimit};
 use serde_json::{Value, json};
 use std::io::{self, Read, Write as _};
@@ -14,15 +20,22 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::mpsc;
+use std::time::Duration;
 
 /// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, stack) in a mesh does as it says
-/// while the shape is described, and `poison: abort-placing` (and so on) while it is placed, in the worker. For tests of
-/// the isolation; no client can set it.
+/// while the shape is described, `poison: abort-placing` (and so on) while it is placed, and `poison: abort-answering`
+/// while a request that names the shape is answered, in the worker. `slow` goes on after some seconds. For tests of the
+/// isolation; no client can set it.
 pub const POISON_VARIABLE: &str = "COSEG_TEST_POISON";
 /// Workers give way to the daemon, which has to answer meanwhile.
 const NICENESS: i32 = 5;
+/// How long slow poison takes.
+const SLOW: Duration = Duration::from_secs(2);
 /// Bytes at the beginning of a mesh that poison is looked for in.
 const POISON_BYTES: usize = 256;
+
+/// The library that a worker has opened, and where.
+type Opened = Option<(PathBuf, Library)>;
 
 /// A header with the bytes that belong to it.
 type Work = (Value, Vec<u8>);
@@ -42,16 +55,22 @@ pub fn run_worker() -> ExitCode {
 fn work() -> io::Result<()> {
     // A worker leaves no core.
     forbid(Resource::Core)?;
-    // Refused where the service manager does not let it: then it is as urgent as the daemon.
-    let _ = nice(NICENESS);
     let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
-    let mut library = None;
+    let (mut library, mut gives_way) = (None, false);
     let work = read_ahead()?;
     write_frame(READY, &[])?;
     for next in work {
         let (header, bytes) = next?;
         limit_memory(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
-        let outcome = if header["library"].is_string() {
+        let max_answer = header["answer"].as_u64();
+        if max_answer.is_none() && !gives_way {
+            gives_way = true;
+            // Refused where the service manager does not let it: then it is as urgent as the daemon.
+            let _ = nice(NICENESS);
+        }
+        let outcome = if let Some(max_bytes) = max_answer {
+            answer(&header, bytes, max_bytes, &mut library, poisoned)
+        } else if header["library"].is_string() {
             place(&header, &mut library, poisoned)
                 .to_string()
                 .into_bytes()
@@ -122,15 +141,96 @@ pub(crate) fn panicked(text: &str) -> Failure {
     }
 }
 
-/// Places a shape, or labels one anew; what came of it, as [`outcome`] reads it.
-fn place(header: &Value, open: &mut Option<(PathBuf, Library)>, poisoned: bool) -> Value {
-    let placed = catch_unwind(AssertUnwindSafe(|| {
-        let dir = Path::new(header["library"].as_str().unwrap_or_default());
-        if open.as_ref().is_none_or(|(of, _)| of != dir) {
-            *open = Some((dir.to_path_buf(), Library::open_beside(dir)?));
+/// The library that the header names, opened if it is not.
+fn opened<'a>(header: &Value, open: &'a mut Opened) -> Result<&'a Library, LibraryError> {
+    let dir = Path::new(header["library"].as_str().unwrap_or_default());
+    if open.as_ref().is_none_or(|(of, _)| of != dir) {
+        *open = Some((dir.to_path_buf(), Library::open_beside(dir)?));
+    }
+    let library = open.as_ref().map(|(_, library)| library);
+    Ok(library.expect("invariant: it was just opened"))
+}
+
+/// Answers a request; why this library is not to be written any more (if so), the reply, and its frames, as
+/// [`read_answer`] reads them.
+fn answer(
+    header: &Value,
+    bytes: Vec<u8>,
+    max_bytes: u64,
+    open: &mut Opened,
+    poisoned: bool,
+) -> Vec<u8> {
+    let answered = catch_unwind(AssertUnwindSafe(|| {
+        let library = opened(header, open).map_err(|e| convert::library_error(&e))?;
+        let malformed = |e: &dyn std::fmt::Display| {
+            let code = ErrorCode::Internal;
+            convert::error(code, ErrorReason::MalformedMessage, e.to_string())
+        };
+        let mut frames = taken_apart(bytes).map_err(|e| malformed(&e))?;
+        if frames.is_empty() {
+            return Err(malformed(&"no request"));
         }
-        let library = open.as_ref().map(|(_, library)| library);
-        let library = library.expect("invariant: it was just opened");
+        let request = wire::Request::decode(frames.remove(0)).map_err(|e| malformed(&e))?;
+        if poisoned && let Some(body) = &request.body {
+            let (collection, shapes) = subjects(body);
+            for shape in shapes {
+                if let Ok((mesh, _)) = library.original(collection, shape) {
+                    take_poison(&mesh, "-answering");
+                }
+            }
+        }
+        let (result, frames) = answers::answer(library, &request, &frames)?;
+        let found = frames.iter().map(|f| f.len() as u64).sum::<u64>();
+        if found > max_bytes {
+            let text = format!("the answer has {found} bytes, the limit is {max_bytes}");
+            let code = ErrorCode::InvalidArgument;
+            return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
+        }
+        Ok((result, frames))
+    }));
+    let answered = answered.unwrap_or_else(|panic| {
+        // What is kept of a collection may be half-way: it is read anew.
+        *open = None;
+        let text = panic_text(panic.as_ref());
+        Err(convert::failure(&Failure {
+            message: format!("the work on this request panicked: {text}"),
+            ..panicked(&text)
+        }))
+    });
+    let library = open.as_ref().map(|(_, library)| library);
+    let stopped = library.and_then(|l| l.store().health().read_only());
+    let cause = stopped.map_or("", |(_, cause)| cause);
+    let (result, frames) = answered.unwrap_or_else(|e| (reply::Result::Error(e), Vec::new()));
+    let reply = wire::Reply {
+        request_id: String::new(),
+        result: Some(result),
+    };
+    let reply = reply.encode_to_vec();
+    let head = [cause.as_bytes(), &reply];
+    joined(head.into_iter().chain(frames.iter().map(Bytes::as_ref)))
+}
+
+/// Reads what [`answer`] made: why the library must not be written any more, if so, and the answer. The error is for
+/// people.
+pub(crate) fn read_answer(mut pieces: Vec<Bytes>) -> Result<(Option<String>, Answer), String> {
+    if pieces.len() < 2 {
+        return Err(format!("a worker said {} pieces", pieces.len()));
+    }
+    let frames = pieces.split_off(2);
+    let cause = String::from_utf8_lossy(&pieces[0]).into_owned();
+    let reply = wire::Reply::decode(pieces.remove(1)).map_err(|e| e.to_string())?;
+    let answer = match reply.result {
+        Some(reply::Result::Error(error)) => Err(error),
+        Some(result) => Ok((result, frames)),
+        None => return Err("a worker said nothing".to_owned()),
+    };
+    Ok((Some(cause).filter(|c| !c.is_empty()), answer))
+}
+
+/// Places a shape, or labels one anew; what came of it, as [`outcome`] reads it.
+fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
+    let placed = catch_unwind(AssertUnwindSafe(|| {
+        let library = opened(header, open)?;
         if let Some(collection) = header["relabel"].as_str() {
             let more = library.relabel_next(Some(collection))?;
             return Ok(json!({ "more": more }));
@@ -261,6 +361,7 @@ fn take_poison(bytes: &[u8], when: &str) {
             let much = vec![1_u8; 100 << 30];
             std::hint::black_box(&much);
         }
+        "slow" => std::thread::sleep(SLOW),
         "stack" => {
             std::hint::black_box(deeper(1));
         }

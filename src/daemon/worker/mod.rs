@@ -1,20 +1,24 @@
-//! Shapes are described and placed in processes of their own, so that none can take the daemon down.
+//! Shapes are described and placed, and requests that compute are answered, in processes of their own, so that no shape
+//! can take the daemon down.
 //!
 //! A worker is the same program again (`coseg worker`): it reads what is to be done from stdin, does it ([`inside`]),
 //! and writes stages and the outcome to stdout, one piece of work after the other. A panic is caught in it and is
-//! that shape's failure. What ends the process (an abort, a stack overflow, memory beyond its limit) or holds it
+//! that shape's failure, or that request's. What ends the process (an abort, a stack overflow, memory beyond its limit) or holds it
 //! beyond the time allowed costs one process; the next shape gets a new one.
 //!
-//! Workers that describe see bytes only. Those that place open the library beside the daemon, which keeps its own
-//! hands off the collection meanwhile; a worker that is killed in the middle of a commit leaves what a crash leaves:
-//! nothing, or all of it.
+//! Workers that describe see bytes only. Those that place or answer open the library beside the daemon, which keeps its
+//! own hands off a collection while one of them changes it; a worker that is killed in the middle of a commit leaves what
+//! a crash leaves: nothing, or all of it.
 
+mod answers;
 mod inside;
 
-pub(crate) use inside::{Outcome, Said, outcome, panicked};
+pub(crate) use answers::subjects;
+pub(crate) use inside::{Outcome, Said, outcome, panicked, read_answer};
 pub use inside::{POISON_VARIABLE, run_worker};
 
 use crate::library::isolate::{self, DescribeJob, Described};
+use bytes::{Buf as _, Bytes};
 use serde_json::{Value, json};
 use std::collections::VecDeque;
 use std::io::{self, BufRead as _, BufReader, Read, Write as _};
@@ -74,12 +78,16 @@ pub(crate) enum Placing<'a> {
 /// Workers that wait for work.
 pub(crate) struct Pool {
     describing: Mutex<Vec<Process>>,
-    /// With the collection that each has served last, and still knows.
-    placing: Mutex<Vec<(String, Process)>>,
+    placing: Mutex<Idle>,
+    /// As urgent as the daemon, which the others give way to.
+    answering: Mutex<Idle>,
     library: PathBuf,
     n_workers: usize,
     threads: usize,
 }
+
+/// Processes with the collection that each has served last, and still knows.
+type Idle = Vec<(String, Process)>;
 
 struct Process {
     child: Child,
@@ -101,6 +109,7 @@ impl Pool {
         let pool = Self {
             describing: Mutex::default(),
             placing: Mutex::default(),
+            answering: Mutex::default(),
             library: library.to_path_buf(),
             n_workers: n_workers.max(1),
             threads: threads.clamp(1, processors),
@@ -118,9 +127,12 @@ impl Pool {
     pub(crate) fn close(&self) {
         locked(&self.describing).clear();
         locked(&self.placing).clear();
+        locked(&self.answering).clear();
     }
 
     fn or_start(&self, kept: Option<Process>) -> Result<Process, Ended> {
+        // One that has ended while it had nothing to do is nobody's fault.
+        let kept = kept.and_then(Process::still_there);
         let process = kept.map_or_else(|| Process::start(self.threads), Ok);
         process.map_err(|e| Ended::died(format!("a worker process cannot be started: {e}")))
     }
@@ -163,21 +175,67 @@ impl Pool {
             }
             Placing::Relabel(collection) => header["relabel"] = json!(collection),
         }
+        let outcome = self.beside(&self.placing, collection, &header, &[], wanted)?;
+        serde_json::from_slice(&outcome).map_err(|e| Ended::died(e.to_string()))
+    }
+
+    /// Answers a request in a worker; what [`read_answer`] reads comes back. Whoever calls this for a change keeps this
+    /// process from using the collection.
+    pub(crate) fn answer(
+        &self,
+        collection: &str,
+        work: &Answering<'_>,
+        wanted: &dyn Fn() -> bool,
+    ) -> Result<Vec<Bytes>, Ended> {
+        let header = json!({
+            "library": self.library,
+            "memory": PLACE_MEMORY + 2 * work.memory,
+            "answer": work.max_bytes,
+        });
+        let sent = joined(
+            [work.request]
+                .into_iter()
+                .chain(work.frames.iter().map(Bytes::as_ref)),
+        );
+        let outcome = self.beside(&self.answering, collection, &header, &sent, wanted)?;
+        taken_apart(outcome).map_err(|e| Ended::died(e.to_string()))
+    }
+
+    /// Runs work in a process that opens the library.
+    fn beside(
+        &self,
+        idle: &Mutex<Idle>,
+        collection: &str,
+        header: &Value,
+        bytes: &[u8],
+        wanted: &dyn Fn() -> bool,
+    ) -> Result<Vec<u8>, Ended> {
         let kept = {
-            let mut idle = locked(&self.placing);
+            let mut idle = locked(idle);
             let at = idle.iter().rposition(|(served, _)| served == collection);
             // Starting another is dearer than learning another collection.
             at.or(idle.len().checked_sub(1)).map(|at| idle.remove(at).1)
         };
         let process = self.or_start(kept)?;
-        let (outcome, process) = process.run(&header, &[], &|_| {}, wanted)?;
-        let outcome = serde_json::from_slice(&outcome).map_err(|e| Ended::died(e.to_string()))?;
-        let mut idle = locked(&self.placing);
+        let (outcome, process) = process.run(header, bytes, &|_| {}, wanted)?;
+        let mut idle = locked(idle);
         if idle.len() < self.n_workers {
             idle.push((collection.to_owned(), process));
         }
         Ok(outcome)
     }
+}
+
+/// A request for a worker.
+pub(crate) struct Answering<'a> {
+    /// The encoded request, with its key but without frames.
+    pub(crate) request: &'a [u8],
+    /// The raw frames that came with it.
+    pub(crate) frames: &'a [Bytes],
+    /// Memory that the work is estimated to take.
+    pub(crate) memory: u64,
+    /// Bytes that the frames of the answer may have.
+    pub(crate) max_bytes: u64,
 }
 
 impl Ended {
@@ -237,6 +295,11 @@ impl Process {
             frames,
             said,
         })
+    }
+
+    /// Itself, unless it has ended.
+    fn still_there(mut self) -> Option<Self> {
+        matches!(self.child.try_wait(), Ok(None)).then_some(self)
     }
 
     /// Sends work, and gives the outcome back together with the process, which can take more.
@@ -319,6 +382,28 @@ impl Drop for Process {
     }
 }
 
+/// Pieces as one, each after its length.
+fn joined<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Vec<u8> {
+    let mut out = Vec::new();
+    for piece in pieces {
+        out.extend_from_slice(&(piece.len() as u64).to_le_bytes());
+        out.extend_from_slice(piece);
+    }
+    out
+}
+
+/// The same back, not copied.
+fn taken_apart(joined: Vec<u8>) -> io::Result<Vec<Bytes>> {
+    let mut rest = Bytes::from(joined);
+    let mut pieces = Vec::new();
+    while !rest.is_empty() {
+        let length = rest.try_get_u64_le().map_err(io::Error::other)?;
+        let length = usize::try_from(length).ok().filter(|n| *n <= rest.len());
+        pieces.push(rest.split_to(length.ok_or(io::ErrorKind::UnexpectedEof)?));
+    }
+    Ok(pieces)
+}
+
 fn read_u64(input: &mut impl Read) -> io::Result<u64> {
     let mut bytes = [0; 8];
     input.read_exact(&mut bytes)?;
@@ -344,4 +429,20 @@ fn read_frame(input: &mut impl Read) -> io::Result<(u8, Vec<u8>)> {
     let mut kind = [0];
     input.read_exact(&mut kind)?;
     Ok((kind[0], read_bytes(input)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{joined, taken_apart};
+
+    #[test]
+    fn pieces_come_back_and_cut_ones_do_not() {
+        let pieces: [&[u8]; 3] = [b"a header", b"", &[7; 300]];
+        let whole = joined(pieces);
+        assert_eq!(taken_apart(whole.clone()).unwrap(), pieces);
+        assert!(taken_apart(Vec::new()).unwrap().is_empty());
+        let cut = (0..whole.len()).filter(|end| taken_apart(whole[..*end].to_vec()).is_ok());
+        // Between two pieces nothing is missing.
+        assert_eq!(cut.collect::<Vec<_>>(), [0, 16, 24]);
+    }
 }

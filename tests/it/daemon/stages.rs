@@ -178,11 +178,6 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             revision,
             wait_ms: 30_000,
         }),
-        Body::Nearest(wire::NearestRequest {
-            collection: c(),
-            shape: "a".to_owned(),
-            ..Default::default()
-        }),
     ];
     for body in waiting {
         let what = format!("{body:?}");
@@ -193,7 +188,14 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             "{what}: {error:?}"
         );
     }
-    // What is asked of another collection is answered.
+    // What changes nothing waits for nobody, nor does what is asked of another collection.
+    let nearest = wire::NearestRequest {
+        collection: c(),
+        shape: "a".to_owned(),
+        ..Default::default()
+    };
+    let neighbors = call!(client, Nearest(nearest)).unwrap().neighbors;
+    assert_eq!(neighbors.len(), 1);
     create_with(client, "d", 2);
     assert_eq!(cancel(client, endless), ItemState::Cancelled);
     // The correction was not forgotten: it was late, and is done now that it can be.
