@@ -93,7 +93,7 @@ class View {
     const [panX, panY] = this.pan;
     const out = new Float32Array(points.length);
     for (let i = 0; i < points.length; i += 3) {
-      const [x, y, z] = [points[i], points[i + 1], points[i + 2]];
+      const x = points[i], y = points[i + 1], z = points[i + 2];
       const near = t[6] * x + t[7] * y + t[8] * z;
       const w = 1 - 0.2 * near;
       out[i] = (((t[0] * x + t[1] * y + t[2] * z) * sx) / w + panX + 1) * 0.5 * width;

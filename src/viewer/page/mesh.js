@@ -59,7 +59,8 @@ class Mesh {
   /** Label of each face, and its part where that is known. */
   setLabels(portrait) {
     const { palette, labels } = portrait;
-    this.labels = Int32Array.from(labels.data, (i) => palette[i]);
+    this.labels = new Int32Array(labels.data.length);
+    for (let f = 0; f < this.labels.length; f++) this.labels[f] = palette[labels.data[f]];
     this.parts = portrait.parts?.data ?? null;
     this.polygons = portrait.polygons?.data ?? null;
   }

@@ -55,7 +55,6 @@ class Raster {
     const between = sidesBetween(mesh);
     const paints = new Map();
     const [solid, faded] = LINE.map((x) => x * SAMPLES);
-    const tint = new Float32Array(9);
     for (let f = 0; f < nFaces; f++) {
       const a = 3 * faces[3 * f], b = 3 * faces[3 * f + 1], c = 3 * faces[3 * f + 2];
       const ax = seen[a], ay = seen[a + 1], az = seen[a + 2];
@@ -70,14 +69,16 @@ class Raster {
       if (left > right || top > bottom) continue;
       let paint = paints.get(labels[f]);
       if (!paint) paints.set(labels[f], (paint = colour(labels[f]).map((x) => (x / 255) ** GAMMA)));
-      // Red, green and blue of the first corner, and how much more the others have.
-      for (let i = 0, l = 12 * f; i < 3; i++) {
-        const first = paint[i] * light[l + i] + light[l + 3];
-        tint[i] = first;
-        tint[3 + i] = paint[i] * light[l + 4 + i] + light[l + 7] - first;
-        tint[6 + i] = paint[i] * light[l + 8 + i] + light[l + 11] - first;
-      }
-      const [r, g, k, rb, gb, kb, rc, gc, kc] = tint;
+      // Red, green and blue of the first corner, and how much more the others have. In a loop, or taken apart as an array,
+      // this would cost as much as all the rest.
+      const l = 12 * f;
+      const pr = paint[0], pg = paint[1], pk = paint[2];
+      const r = pr * light[l] + light[l + 3];
+      const g = pg * light[l + 1] + light[l + 3];
+      const k = pk * light[l + 2] + light[l + 3];
+      const rb = pr * light[l + 4] + light[l + 7] - r, rc = pr * light[l + 8] + light[l + 11] - r;
+      const gb = pg * light[l + 5] + light[l + 7] - g, gc = pg * light[l + 9] + light[l + 11] - g;
+      const kb = pk * light[l + 6] + light[l + 7] - k, kc = pk * light[l + 10] + light[l + 11] - k;
       // Samples between a corner and the side opposite, where that side is between two labels.
       const lines = between[f];
       const toA = lines & 1 ? Math.abs(area) / Math.hypot(cx - bx, cy - by) : Infinity;
@@ -117,7 +118,7 @@ class Raster {
     const { data } = picture;
     for (let y = 0, p = 0; y < height; y++)
       for (let x = 0; x < width; x++, p += 4) {
-        let [n, r, g, b] = [0, 0, 0, 0];
+        let n = 0, r = 0, g = 0, b = 0;
         for (let j = 0; j < SAMPLES; j++)
           for (let i = 0; i < SAMPLES; i++) {
             const sample = colours[(y * SAMPLES + j) * columns + x * SAMPLES + i];
@@ -144,7 +145,7 @@ function sidesBetween({ positions, faces, nFaces, labels }) {
   const of = new Int32Array(n).fill(-2);
   const mixed = new Uint8Array(n);
   for (let c = 0; c < 3 * nFaces; c++) {
-    const [v, label] = [faces[c], labels[(c / 3) | 0]];
+    const v = faces[c], label = labels[(c / 3) | 0];
     if (of[v] === -2) of[v] = label;
     else if (of[v] !== label) mixed[v] = 1;
   }
