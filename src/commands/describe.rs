@@ -105,6 +105,17 @@ impl Running {
     }
 }
 
+/// What there is to do.
+pub(super) struct Task<'a> {
+    /// The file's bytes and their format.
+    pub(super) mesh: (&'a [u8], Format),
+    pub(super) params: &'a Params,
+    /// Where what it takes is noted.
+    pub(super) laps: &'a Laps,
+    /// Where arrays go.
+    pub(super) out: Option<&'a Path>,
+}
+
 /// What there is to print.
 pub(super) struct Summary {
     pub(super) area: f64,
@@ -145,11 +156,13 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
     let pool = pool.map_err(|e| CommandError::Failed(format!("cannot start threads: {e}")))?;
     let (summary, laps) = pool.install(|| {
         let laps = Laps::default();
-        let out = args.out.as_deref();
-        let summary = match args.full {
-            true => full(&bytes, format, &params, &laps, out),
-            false => proxy(&bytes, format, &params, &laps, out),
+        let task = Task {
+            mesh: (&bytes, format),
+            params: &params,
+            laps: &laps,
+            out: args.out.as_deref(),
         };
+        let summary = if args.full { full(&task) } else { proxy(&task) };
         let summary = summary.map_err(|e| e.of(&path))?;
         Ok::<_, CommandError>((summary, laps.finish()))
     })?;
@@ -179,13 +192,13 @@ impl Trouble {
     }
 }
 
-fn proxy(
-    bytes: &[u8],
-    format: Format,
-    params: &Params,
-    laps: &Laps,
-    out: Option<&Path>,
-) -> Result<Summary, Trouble> {
+fn proxy(task: &Task<'_>) -> Result<Summary, Trouble> {
+    let Task {
+        mesh: (bytes, format),
+        params,
+        laps,
+        out,
+    } = *task;
     let described = describe(bytes, format, params, &|name| laps.enter(name));
     let d = described.map_err(Trouble::mesh)?;
     if let Some(out) = out {

@@ -1,9 +1,9 @@
 //! `coseg describe --full`: operator, spectrum and signatures at input resolution, in double precision.
 
-use super::describe::{Laps, Summary, Trouble};
+use super::describe::{Laps, Summary, Task, Trouble};
 use coseg::descriptors::{PointKernels, gps_scales, hks_times, null_space, shape_dna};
-use coseg::mesh::{self, Cleaned, Format};
-use coseg::pipeline::{MeshSpectrum, N_HKS_TIMES, Params, spectrum_of};
+use coseg::mesh::{self, Cleaned};
+use coseg::pipeline::{MeshSpectrum, N_HKS_TIMES, spectrum_of};
 use coseg::store::ArrayStream;
 use safetensors::tensor::Dtype;
 use std::io;
@@ -36,13 +36,13 @@ impl Signatures {
 }
 
 /// The spectrum at input resolution; what goes to `out` goes there as it is copied out of the solver.
-pub(super) fn full(
-    bytes: &[u8],
-    format: Format,
-    params: &Params,
-    laps: &Laps,
-    out: Option<&Path>,
-) -> Result<Summary, Trouble> {
+pub(super) fn full(task: &Task<'_>) -> Result<Summary, Trouble> {
+    let Task {
+        mesh: (bytes, format),
+        params,
+        laps,
+        out,
+    } = *task;
     laps.enter("parse");
     let parsed = mesh::parse(bytes, format).map_err(Trouble::mesh)?;
     laps.enter("clean");

@@ -18,6 +18,7 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         from: args.from.clone(),
         to: args.to.clone(),
         points: args.points.then(|| options(&args.landmark, args.mirrored)),
+        agreement: true,
     };
     let (map, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
     if let Some(path) = &args.out {
@@ -73,6 +74,7 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
             "to": args.to,
             "c_12_shape": shape,
             "quality": json::quality(&quality),
+            "agreement": map.agreement.as_ref().map(json::agreement),
             "alternative_quality": map.alternative_quality.as_ref().map(json::quality),
             "alternative_cost": map.alternative_cost,
             "matches": matches,
@@ -94,6 +96,9 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
     if args.points {
         session.line(&point_line(&quality, map.alternative_cost))?;
         return Ok(true);
+    }
+    if let Some(agreement) = &map.agreement {
+        session.line(&agreement_line(agreement))?;
     }
     let (from, to) = (
         format!("part of {}", args.from),
@@ -150,6 +155,21 @@ pub(super) fn match_line(q: &wire::MapQuality) -> String {
         );
     }
     line
+}
+
+/// How a map agrees with the others of its collection.
+fn agreement_line(a: &wire::MapAgreement) -> String {
+    let (n, departure) = (a.n_triangles, a.departure);
+    match (n, a.inconsistent) {
+        (0 | 1, _) => format!("triangles with other maps: {n}, too few to say whether it agrees"),
+        (_, false) => {
+            format!("agrees with other maps around {n} triangles (departure {departure:.2})")
+        }
+        (_, true) => format!(
+            "does not agree with other maps around {n} triangles (departure {departure:.2}); \
+             coseg check --repair makes it anew"
+        ),
+    }
 }
 
 /// What is known of a map between points besides, and of its alternative.

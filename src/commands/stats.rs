@@ -33,6 +33,7 @@ pub(crate) fn json(s: &wire::StatsReply) -> Value {
         "resident_bytes": s.resident_bytes,
         "n_placed": s.n_placed,
         "n_relabelled": s.n_relabelled,
+        "n_inconsistent_maps": s.n_inconsistent_maps,
         "n_events": s.n_events,
         "received_bytes": s.received_bytes,
         "sent_bytes": s.sent_bytes,

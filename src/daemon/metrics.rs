@@ -77,6 +77,7 @@ pub(crate) struct Metrics {
     stage_seconds: Labelled<Stage, Histogram>,
     finished: Labelled<OutcomeLabel, Counter>,
     pub(crate) relabelled: Counter,
+    pub(crate) inconsistent: Counter,
     pub(crate) events: Counter,
     pub(crate) replies: Counter,
     pub(crate) received_bytes: Counter,
@@ -119,6 +120,7 @@ impl Metrics {
             stage_seconds: Family::new_with_constructor(|| Histogram::new(STAGE_BOUNDS)),
             finished: Family::default(),
             relabelled: Counter::default(),
+            inconsistent: Counter::default(),
             events: Counter::default(),
             replies: Counter::default(),
             received_bytes: Counter::default(),
@@ -213,6 +215,11 @@ impl Metrics {
             "Stored shapes that got new labels in idle time",
             self.relabelled.clone(),
         );
+        r.register(
+            "maps_inconsistent",
+            "Maps to new shapes that did not agree with the maps between the shapes they come from",
+            self.inconsistent.clone(),
+        );
         r.register("events", "Events published", self.events.clone());
         r.register(
             "replies",
@@ -257,6 +264,7 @@ impl Metrics {
             Outcome::Unchanged => "unchanged",
         };
         self.finished(outcome);
+        self.inconsistent.inc_by(placed.n_inconsistent.into());
         let mut stages = self.stages.lock().unwrap_or_else(PoisonError::into_inner);
         for (stage, ms) in &placed.stages_ms {
             let label = Stage {
@@ -380,6 +388,7 @@ mod tests {
             sequence: 1,
             n_maps: 0,
             n_relabelled: 0,
+            n_inconsistent: 1,
             stages_ms: vec![("spectrum".to_owned(), 40.0), ("place".to_owned(), 2.0)],
         };
         metrics.placed(&placed);

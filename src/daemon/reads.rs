@@ -141,6 +141,8 @@ fn kept_map(
             .kept_point_maps(collection, from, to, &convert::point_request(points))
             .map_err(refuse)?
             .map(|maps| convert::point_maps(&maps, frames)),
+        // To compare it with the others is to compute.
+        None if r.agreement => None,
         None => library
             .kept_map(collection, from, to)
             .map_err(refuse)?
@@ -277,6 +279,7 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
         workers: daemon.n_workers as u32,
         n_placed: daemon.metrics.n_placed(),
         n_relabelled: daemon.metrics.relabelled.get(),
+        n_inconsistent_maps: daemon.metrics.inconsistent.get(),
         n_events: daemon.metrics.events.get(),
         received_bytes: daemon.metrics.received_bytes.get(),
         sent_bytes: daemon.metrics.sent_bytes.get(),

@@ -42,8 +42,7 @@ impl Basis<'_> {
 
     /// The first `k` eigenvectors `(n, k)`, row-major.
     pub fn leading(&self, k: usize) -> Vec<f32> {
-        let rows = self.eigenvectors.chunks_exact(self.n_eigenvectors.max(1));
-        rows.flat_map(|row| row[..k].iter().copied()).collect()
+        super::samples::columns(self.eigenvectors, self.n_eigenvectors.max(1), k)
     }
 
     /// Coefficients `(k, dim)` of functions `values (n, dim)`: `Φᵀ A values`, all row-major.

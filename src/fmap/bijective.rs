@@ -66,41 +66,37 @@ impl Hints {
         guidance: Option<&Guidance<'_>>,
         turn: Option<&Turn<'_>>,
     ) -> Self {
-        // Columns at the samples of shape 1 and of shape 2, and how many.
-        let (mut ones, mut twos) = (Vec::new(), Vec::new());
         let scale = |weight: f32| (weight * 2.0 * pair.k as f32).sqrt();
-        let scaled = |x: &[f32], s: f32| -> Vec<f32> { x.iter().map(|v| s * v).collect() };
+        let crossed = turn.map(|t| {
+            let (rows_1, rows_2) = ((&one.rows[..], one.k), (&two.rows[..], two.k));
+            let (x1, x2, dim) = t.one.at_samples(t.two, &pair.c_12, pair.k, rows_1, rows_2);
+            (x1, x2, dim, scale(t.weight), t.sign)
+        });
+        // Columns at the samples of shape 1 and of shape 2, how many, and what they are scaled by.
+        let (mut ones, mut twos) = (Vec::new(), Vec::new());
         if let Some(g) = guidance.filter(|g| g.weight > 0.0) {
-            let s = scale(g.weight);
-            ones.push((scaled(g.one, s), g.dim));
-            twos.push((scaled(g.two, s), g.dim));
+            ones.push((g.one, g.dim, scale(g.weight)));
+            twos.push((g.two, g.dim, scale(g.weight)));
         }
-        if let Some(t) = turn {
-            let (x1, x2, dim) = t.one.at_samples(
-                t.two,
-                &pair.c_12,
-                pair.k,
-                (&one.rows, one.k),
-                (&two.rows, two.k),
-            );
-            let s = scale(t.weight);
-            ones.push((scaled(&x1, s), dim));
-            twos.push((scaled(&x2, s * t.sign), dim));
+        if let Some((x1, x2, dim, scale, sign)) = &crossed {
+            ones.push((x1, *dim, *scale));
+            twos.push((x2, *dim, scale * sign));
         }
         Self {
-            dim: ones.iter().map(|(_, dim)| dim).sum(),
+            dim: ones.iter().map(|(_, dim, _)| dim).sum(),
             one: side_by_side(&ones, one.n),
             two: side_by_side(&twos, two.n),
         }
     }
 }
 
-/// Matrices of `n` rows become one, `(n, sum of their columns)`.
-fn side_by_side(parts: &[(Vec<f32>, usize)], n: usize) -> Vec<f32> {
-    let mut rows = Vec::new();
+/// Matrices of `n` rows, each with its columns and a factor, become one, `(n, sum of their columns)`.
+fn side_by_side(parts: &[(&[f32], usize, f32)], n: usize) -> Vec<f32> {
+    let dim: usize = parts.iter().map(|(_, dim, _)| dim).sum();
+    let mut rows = Vec::with_capacity(n * dim);
     for v in 0..n {
-        for (x, dim) in parts {
-            rows.extend_from_slice(&x[v * dim..(v + 1) * dim]);
+        for (x, dim, scale) in parts {
+            rows.extend(x[v * dim..(v + 1) * dim].iter().map(|x| scale * x));
         }
     }
     rows

@@ -104,22 +104,19 @@ impl Orientation {
     ) -> Vec<f32> {
         let rows = c_12.len() / columns.max(1);
         let c = |a: usize, i: usize| c_12[a * columns + i];
-        let mut out = Vec::new();
+        let there = other.pairs(rows.min(k)).count();
+        let mut minors = Vec::new();
         for (_, i, j) in self.pairs(k.min(columns)) {
-            let from = out.len();
-            out.resize(from + other.q, 0.0f32);
-            for (pair, a, b) in other.pairs(rows.min(k)) {
-                let row = &other.crossed[pair * other.q..(pair + 1) * other.q];
-                let (ci, cj) = (self.first + i, self.first + j);
+            let (ci, cj) = (self.first + i, self.first + j);
+            minors.extend(other.pairs(rows.min(k)).map(|(_, a, b)| {
                 let (ra, rb) = (other.first + a, other.first + b);
                 let minor = c(ra, ci) * c(rb, cj) - c(rb, ci) * c(ra, cj);
-                let scale = self.scale[i] * self.scale[j] / (other.scale[a] * other.scale[b]);
-                for (sum, x) in out[from..].iter_mut().zip(row) {
-                    *sum += minor * scale * x;
-                }
-            }
+                minor * self.scale[i] * self.scale[j] / (other.scale[a] * other.scale[b])
+            }));
         }
-        out
+        let (crossed, q) = other.crossed(rows.min(k));
+        let n = minors.len() / there.max(1);
+        super::basis::product(&minors, &crossed, n, there, q)
     }
 
     /// How a map from this shape to `other` agrees with orientation, −1 (reverses) to 1 (keeps): the cosine between

@@ -139,9 +139,12 @@ fn refined(
     let sampled = SampledBasis::new(&basis_2, &queries, &mass, two.n_eigenvectors);
     let most = (one.n_eigenvectors, sampled.k);
     let embedding = |spectral: &[f32], k: usize, x: &[f32], beta: f32| -> Vec<f32> {
-        let rows = spectral.chunks_exact(k).zip(x.chunks_exact(dim));
-        rows.flat_map(|(phi, x)| phi.iter().copied().chain(x.iter().map(move |x| beta * x)))
-            .collect()
+        let mut rows = Vec::with_capacity(spectral.len() + x.len());
+        for (phi, x) in spectral.chunks_exact(k).zip(x.chunks_exact(dim)) {
+            rows.extend_from_slice(phi);
+            rows.extend(x.iter().map(|x| beta * x));
+        }
+        rows
     };
     let weight = |k: usize| (options.descriptor_weight * k as f32 / mean_norm).sqrt();
     // For each query the vertex of shape 1 it is matched with.

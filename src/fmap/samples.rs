@@ -171,10 +171,11 @@ pub(super) fn columns(values: &[f32], stride: usize, k: usize) -> Vec<f32> {
     if k == stride {
         return values.to_vec();
     }
-    values
-        .chunks_exact(stride)
-        .flat_map(|row| row[..k].iter().copied())
-        .collect()
+    let mut cut = Vec::with_capacity(values.len() / stride * k);
+    for row in values.chunks_exact(stride) {
+        cut.extend_from_slice(&row[..k]);
+    }
+    cut
 }
 
 /// Lower factor `(k, k)` of a symmetric matrix, row-major, and how many leading rows are positive definite.

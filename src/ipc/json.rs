@@ -115,6 +115,7 @@ pub fn job_item(i: &wire::JobItem) -> Value {
         value["sequence"] = p.sequence.into();
         value["n_maps"] = p.n_maps.into();
         value["n_relabelled"] = p.n_relabelled.into();
+        value["n_inconsistent"] = p.n_inconsistent.into();
         let stages = p.stages.iter().map(|s| (s.stage.clone(), s.ms.into()));
         value["stages_ms"] = Value::Object(stages.collect());
     }
@@ -147,6 +148,15 @@ pub fn quality(q: &wire::MapQuality) -> Value {
         "matched": q.matched,
         "descriptor_return": q.descriptor_return,
         "confidence": q.confidence,
+    })
+}
+
+/// How a map agrees with the others of its collection.
+pub fn agreement(a: &wire::MapAgreement) -> Value {
+    json!({
+        "n_triangles": a.n_triangles,
+        "departure": a.departure,
+        "inconsistent": a.inconsistent,
     })
 }
 

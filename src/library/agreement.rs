@@ -3,7 +3,7 @@
 use super::commit::map_row;
 use super::lane::Lane;
 use super::rows::quality_from_json;
-use super::{Library, Result};
+use super::{Library, MapInfo, Result};
 use crate::fmap::consistency::{Link, Standing};
 use crate::fmap::latent::LatentBasis;
 use crate::fmap::{FunctionalMap, MapOptions};
@@ -45,6 +45,48 @@ impl Library {
     pub fn mend_maps(&self, collection: &str) -> Result<Vec<String>> {
         let row = self.collection_row(collection)?;
         self.with_lane(row, |lane| self.mend_in(lane))
+    }
+
+    /// How a map for parts agrees with the kept ones of its collection; `None` if it is too small to compare.
+    ///
+    /// # Errors
+    /// There is no such collection or shape, or the catalog cannot be read.
+    pub fn standing(
+        &self,
+        collection: &str,
+        from: &str,
+        to: &str,
+        map: &MapInfo,
+    ) -> Result<Option<Standing>> {
+        let (_, a) = self.shape_row(collection, from)?;
+        let (row, b) = self.shape_row(collection, to)?;
+        let kept = self.kept_maps(&row)?;
+        Ok(kept.standing_of(a.id, b.id, &map.c_12, map.k1))
+    }
+
+    /// How many maps to a new shape do not agree with the maps between the shapes they come from. Those are noted in the
+    /// log; their votes count as their confidence says.
+    pub(super) fn n_inconsistent(&self, maps: &[(ShapeId, FunctionalMap)]) -> Result<u32> {
+        let sources = maps.iter().map(|(from, _)| *from).collect();
+        let catalog = self.store.catalog();
+        let kept = catalog.read(|r| -> Result<_> { Ok(KeptMaps::among(r, sources)?) })?;
+        let new: Vec<_> = maps
+            .iter()
+            .map(|(from, map)| (*from, map.c_12.as_slice(), map.k1))
+            .collect();
+        let mut n = 0;
+        for (from, standing) in kept.standings_of_new(&new) {
+            if standing.inconsistent {
+                let Standing {
+                    departure,
+                    n_triangles,
+                    ..
+                } = standing;
+                tracing::info!(%from, departure, n_triangles, "a map to the new shape disagrees");
+                n += 1;
+            }
+        }
+        Ok(n)
     }
 
     fn kept_maps(&self, row: &CollectionRow) -> Result<KeptMaps> {

@@ -135,8 +135,7 @@ impl Library {
 
 /// Refuses what was cancelled while it was placed, so that it is either cancelled or placed.
 fn still_queued(tx: &Tx<'_>, accepted: &JobItemRow) -> Result<()> {
-    let items = tx.job_items(accepted.job)?;
-    let item = items.iter().find(|i| i.index == accepted.index);
+    let item = tx.job_item(accepted.job, accepted.index)?;
     if item.is_some_and(|i| i.status == ItemStatus::Queued) {
         return Ok(());
     }

@@ -55,8 +55,7 @@ impl Library {
     /// The catalog cannot be written.
     pub fn note_attempt(&self, item: &JobItem, why: &str) -> Result<u32> {
         self.store.catalog().write(|tx| {
-            let rows = tx.job_items(item.job)?;
-            let row = rows.into_iter().find(|r| r.index == item.index);
+            let row = tx.job_item(item.job, item.index)?;
             let Some(row) = row.filter(|r| r.status == ItemStatus::Queued) else {
                 // Cancelled meanwhile.
                 return Ok(0);

@@ -100,6 +100,7 @@ impl Library {
                 labelling = Some(carried.labelling);
             }
         }
+        let n_inconsistent = self.n_inconsistent(&maps)?;
         lap("place");
         let due = lane.shapes.len() as u64 + 1 >= lane.state.next_recluster;
         let plan = match (taught, labelling, &lane.learnt) {
@@ -145,6 +146,7 @@ impl Library {
             sequence: 0,
             n_maps: maps.len() as u32,
             n_relabelled,
+            n_inconsistent,
             stages_ms,
         };
         let commit = Commit {

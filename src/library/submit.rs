@@ -274,6 +274,7 @@ impl Library {
                         sequence: lane.row.sequence,
                         n_maps: 0,
                         n_relabelled: 0,
+                        n_inconsistent: 0,
                         stages_ms: Vec::new(),
                     };
                     self.store.catalog().write(|tx| -> Result<()> {
@@ -369,11 +370,10 @@ impl Library {
     }
 
     pub(super) fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
-        let rows = self
+        let row = self
             .store
             .catalog()
-            .read(|r| r.job_items(item.job).map_err(LibraryError::from))?;
-        let row = rows.into_iter().find(|r| r.index == item.index);
+            .read(|r| r.job_item(item.job, item.index).map_err(LibraryError::from))?;
         row.ok_or_else(|| LibraryError::NotFound {
             what: "job item",
             name: format!("{} of job {}", item.index, item.job),

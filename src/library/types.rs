@@ -323,6 +323,9 @@ pub struct Placed {
     pub n_maps: u32,
     /// Stored shapes whose labels were recomputed inside this addition.
     pub n_relabelled: u32,
+    /// Of these maps those that do not agree with the maps between the shapes they come from.
+    #[serde(default)]
+    pub n_inconsistent: u32,
     /// Milliseconds by stage, in order: parse, clean, proxy, laplacian, spectrum, descriptors, ...
     pub stages_ms: Vec<(String, f64)>,
 }

@@ -5,6 +5,7 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
+use pulp::Arch;
 
 const BLOCK: usize = 256;
 
@@ -104,48 +105,61 @@ pub fn nearest_in_cells(
     let mut cells = vec![(f32::INFINITY, u32::MAX); n_queries * n_probed];
     products(queries, &centre_rows, dim, |q, c0, column| {
         let probed = &mut cells[q * n_probed..(q + 1) * n_probed];
-        for (i, p) in column.iter().enumerate() {
-            let value = centre_norms[c0 + i] - p;
-            if value < probed[n_probed - 1].0 {
-                let at = probed.partition_point(|x| x.0 <= value);
-                probed[at..].rotate_right(1);
-                probed[at] = (value, (c0 + i) as u32);
+        let norms = &centre_norms[c0..c0 + column.len()];
+        for (block, (p, norms)) in column.chunks(8).zip(norms.chunks(8)).enumerate() {
+            let mut values = [f32::INFINITY; 8];
+            for ((value, norm), p) in values.iter_mut().zip(norms).zip(p) {
+                *value = norm - p;
             }
-        }
-    });
-    let mut nearest = vec![0u32; n_queries];
-    for q in 0..n_queries {
-        let query = &queries[q * dim..(q + 1) * dim];
-        let mut best = (f32::INFINITY, u32::MAX);
-        for &(_, c) in &cells[q * n_probed..(q + 1) * n_probed] {
-            for at in offsets[c as usize]..offsets[c as usize + 1] {
-                let value = norms[at] - dot(query, &grouped[at * dim..(at + 1) * dim]);
-                if value < best.0 || (value == best.0 && members[at] < best.1) {
-                    best = (value, members[at]);
+            let last = probed[n_probed - 1].0;
+            if !values.map(|value| value < last).contains(&true) {
+                continue;
+            }
+            for (i, &value) in values.iter().enumerate() {
+                let mut at = n_probed;
+                while at > 0 && value < probed[at - 1].0 {
+                    if at < n_probed {
+                        probed[at] = probed[at - 1];
+                    }
+                    at -= 1;
+                }
+                if at < n_probed {
+                    probed[at] = (value, (c0 + 8 * block + i) as u32);
                 }
             }
         }
-        nearest[q] = best.1;
+    });
+    // All queries that ask for a cell are one product.
+    let mut asking = vec![Vec::new(); n_cells];
+    for (at, (_, c)) in cells.iter().enumerate() {
+        asking[*c as usize].push(at / n_probed);
     }
-    nearest
-}
-
-/// Eight independent sums, so that the compiler can keep them in vector registers.
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let mut sums = [0.0f32; 8];
-    let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f32 = a8
-        .remainder()
-        .iter()
-        .zip(b8.remainder())
-        .map(|(x, y)| x * y)
-        .sum();
-    for (x, y) in a8.zip(b8) {
-        for lane in 0..8 {
-            sums[lane] += x[lane] * y[lane];
+    let mut nearest = vec![(f32::INFINITY, u32::MAX); n_queries];
+    let mut rows = Vec::new();
+    for (c, asking) in asking.iter().enumerate() {
+        let (from, to) = (offsets[c], offsets[c + 1]);
+        if from == to {
+            continue;
         }
+        rows.clear();
+        for q in asking {
+            rows.extend_from_slice(&queries[q * dim..(q + 1) * dim]);
+        }
+        products(
+            &rows,
+            &grouped[from * dim..to * dim],
+            dim,
+            |i, t0, column| {
+                let t0 = from + t0;
+                let (at, value) = least(column, &norms[t0..t0 + column.len()]);
+                let (best, member) = (&mut nearest[asking[i]], members[t0 + at]);
+                if value < best.0 || (value == best.0 && member < best.1) {
+                    *best = (value, member);
+                }
+            },
+        );
     }
-    sums.iter().sum::<f32>() + rest
+    nearest.into_iter().map(|(_, member)| member).collect()
 }
 
 fn half_norms(rows: &[f32], dim: usize) -> Vec<f32> {
@@ -168,6 +182,7 @@ fn products(
         n_targets > 0,
         "the nearest of no rows: at least one target is needed"
     );
+    let arch = Arch::new();
     // Column q of the product holds query q against a block of targets: contiguous for the scan.
     let mut product = Mat::<f32>::zeros(BLOCK.min(n_targets), BLOCK.min(n_queries.max(1)));
     for q0 in (0..n_queries).step_by(BLOCK) {
@@ -185,18 +200,21 @@ fn products(
                 1.0f32,
                 Par::Seq,
             );
-            for j in 0..nq {
-                let column = block.as_ref().col(j);
-                let Some(column) = column.try_as_col_major() else {
-                    unreachable!("owned columns")
-                };
-                visit(q0 + j, t0, column.as_slice());
-            }
+            arch.dispatch(|| {
+                for j in 0..nq {
+                    let column = block.as_ref().col(j);
+                    let Some(column) = column.try_as_col_major() else {
+                        unreachable!("owned columns")
+                    };
+                    visit(q0 + j, t0, column.as_slice());
+                }
+            });
         }
     }
 }
 
 /// Index and value of the least `half_norm − product`; the lowest index on ties.
+#[inline(always)]
 fn least(product: &[f32], half_norms: &[f32]) -> (usize, f32) {
     // Eight independent lanes let the compiler keep the scan in vector registers.
     let mut value = [f32::INFINITY; 8];

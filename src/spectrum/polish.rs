@@ -13,11 +13,11 @@ use crate::linalg::panel::{Row, Tile, WIDTH, ZERO_TILE};
 use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 
 /// Pairs whose residuals are at most this share of what is allowed are left as they are.
-const GOOD_ENOUGH: f64 = 0.3;
+const GOOD_ENOUGH: f64 = 0.7;
 
 /// So many pairs, or this share of all, are corrected one panel after the other.
 const FEW: usize = 16;
-const FEW_OF: usize = 8;
+const FEW_OF: usize = 4;
 
 /// Inner products above this have squares that count.
 const SMALL_TURN: f64 = 1e-6;
@@ -129,8 +129,8 @@ fn measure(
     }
 }
 
-/// Corrects the pairs at `poor`, ascending: what their residuals r, measured on W, have outside of the
-/// span of all pairs is solved for and subtracted.
+/// Corrects the pairs at `poor`, ascending: their residuals r, measured on W, are solved for, and what that has outside
+/// of the span of all pairs is subtracted.
 ///
 /// `x - (S - σ)⁻¹ r` is what a step of inverse iteration at σ makes of x, to first order in the error. But the
 /// rounding of the factor, which is what left x as it is, now acts on a correction of the size of r. Errors
@@ -144,10 +144,10 @@ fn correct(
     poor: &[usize],
 ) {
     let mut scratch = Scratch::default();
-    for group in poor.chunks(WIDTH) {
-        let rows: usize = pairs.vectors.rows_of(0).map(<[Row]>::len).sum();
+    let n_rows: usize = pairs.vectors.rows_of(0).map(<[Row]>::len).sum();
+    let solved = poor.chunks(WIDTH).map(|group| {
         scratch.x.clear();
-        scratch.x.resize(rows, Row::ZERO);
+        scratch.x.resize(n_rows, Row::ZERO);
         for (to, &pair) in group.iter().enumerate() {
             let from = pairs.vectors.rows_of(pair / WIDTH).flatten();
             for (x, row) in scratch.x.iter_mut().zip(from) {
@@ -155,13 +155,22 @@ fn correct(
             }
         }
         component.measure(&mut scratch);
-        let correction = &mut scratch.residuals;
-        pairs.vectors.remove(0, [&mut correction[..]]);
-        factor.solve(correction, parallel);
-        pairs.vectors.remove(0, [&mut correction[..]]);
+        let mut panel = std::mem::take(&mut scratch.residuals);
+        factor.solve(&mut panel, parallel);
+        panel
+    });
+    let mut corrections: Vec<Vec<Row>> = solved.collect();
+    let (two_by_two, last) = corrections.as_chunks_mut::<2>();
+    for [a, b] in two_by_two {
+        pairs.vectors.remove(0, [&mut a[..], &mut b[..]]);
+    }
+    for panel in last {
+        pairs.vectors.remove(0, [&mut panel[..]]);
+    }
+    for (group, correction) in poor.chunks(WIDTH).zip(&corrections) {
         for (from, &pair) in group.iter().enumerate() {
             let to = pairs.vectors.rows_of_mut(pair / WIDTH).flatten();
-            for (row, x) in to.zip(correction.iter()) {
+            for (row, x) in to.zip(correction) {
                 row.0[pair % WIDTH] -= x.0[from];
             }
         }

@@ -12,10 +12,11 @@ const FRAME: &str = include_str!("page/page.html");
 /// The viewer's looks.
 pub const STYLE: &str = include_str!("page/style.css");
 /// The viewer's scripts, in the order in which they use each other.
-const SCRIPTS: [&str; 7] = [
+const SCRIPTS: [&str; 8] = [
     include_str!("page/data.js"),
     include_str!("page/mesh.js"),
     include_str!("page/draw.js"),
+    include_str!("page/raster.js"),
     include_str!("page/gallery.js"),
     include_str!("page/stage.js"),
     include_str!("page/panel.js"),

@@ -57,6 +57,10 @@ def spoilt() -> dict[str, tuple[str, bytes]]:
         "a word among the numbers of a PLY": ("h.ply", ply.encode()),
         "glTF with its buffer in another file": ("i.gltf", json.dumps(gltf).encode()),
         "glTF that needs Draco": ("j.gltf", json.dumps(draco).encode()),
+        "a glTF node names a mesh that is not there": (
+            "m.gltf",
+            json.dumps(gltf | {"nodes": [{"mesh": 17}]}).encode(),
+        ),
         "another format than its name says": ("k.glb", CUBE_OFF.encode()),
         "nothing in it": ("l.ply", b""),
     }

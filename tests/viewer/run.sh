@@ -2,9 +2,12 @@
 # The viewer in headless Chromium: live against a real daemon with made shapes, and as a file.
 #
 #   tests/viewer/run.sh [OUT]     screenshots go to OUT (default: a temporary folder)
+#   COSEG_VIEWER_PICTURES=docs/images tests/viewer/run.sh
+#                                 and makes the pictures of the documents anew
 #   COSEG_VIEWER_SHAPES=400 tests/viewer/run.sh [OUT]
 #                                 and how soon so many chairs appear, live and as a file: COSEG_VIEWER_MS is the limit
-#                                 (2000). Labelling 400 takes three minutes; nothing else should run meanwhile.
+#                                 (2000) for the middle one of three rounds. Labelling 400 takes three
+#                                 minutes; nothing else should run meanwhile.
 #
 # Needs target/release/coseg, or COSEG_BIN. Installs Chromium, Node and npm from Debian where they are missing.
 set -euo pipefail
@@ -60,6 +63,11 @@ done
 "$coseg" view chairs -o "$work/chairs.html" --timeout 60
 
 (cd "$work" && COSEG_BIN="$coseg" node viewer.mjs all "$url" "$out" "$work/chairs.html")
+
+if [ -n "${COSEG_VIEWER_PICTURES:-}" ]; then
+    pictures=$(cd "$COSEG_VIEWER_PICTURES" && pwd)
+    (cd "$work" && COSEG_BIN="$coseg" node viewer.mjs pictures "$url" "$pictures" "$work/chairs")
+fi
 
 if [ -n "${COSEG_VIEWER_SHAPES:-}" ]; then
     "$coseg" synth chair --count "$COSEG_VIEWER_SHAPES" --faces 2500 --out "$work/many" >/dev/null 2>&1

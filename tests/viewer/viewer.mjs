@@ -2,6 +2,7 @@
 //
 //   node viewer.mjs empty URL OUT          a library without a collection
 //   node viewer.mjs all URL OUT FILE       everything, live and from a file; COSEG_BIN and COSEG_ENDPOINT are set
+//   node viewer.mjs pictures URL OUT FOLDER the pictures of the documents; FOLDER has the made chairs with their true labels
 //   node viewer.mjs many URL OUT FILE      how soon a collection of hundreds, `many`, appears; COSEG_VIEWER_MS is the limit
 
 import assert from "node:assert/strict";
@@ -102,6 +103,7 @@ if (what === "many") {
         const before = processorTime();
         const page = await open(address);
         const used = processorTime() - before;
+        // Since the page was asked for: all cards are there, and all that are in sight show their shape.
         const { visibleMs, loadedMs } = await ready(page);
         assert.equal(await page.$$eval(".card", (cards) => cards.length), n);
         const drawn = await page.$$eval(".card canvas[data-drawn]", (cards) => cards.length);
@@ -115,9 +117,52 @@ if (what === "many") {
         assert.deepEqual(page.faults, []);
         await page.context().close();
       }
-      assert.ok(Math.min(...seen) < limit, `the quickest of three took ${Math.min(...seen)} ms`);
+      const median = seen.sort((a, b) => a - b)[1];
+      assert.ok(median < limit, `of three, the middle one took ${median} ms`);
     });
   }
+} else if (what === "pictures") {
+  await test("the pictures of the documents", async () => {
+    // Each label is called what most of its faces truly are.
+    const truth = readFileSync(`${file}/LABEL_NAMES.txt`, "utf8").trim().split("\n").map((line) => line.split(/\s+/).at(-1));
+    const votes = new Map();
+    for (const { name } of coseg("ls", "--collection", "chairs").shapes) {
+      const known = readFileSync(`${file}/${name}.labels.txt`, "utf8").trim().split(/\s+/).map(Number);
+      coseg("labels", name, "--collection", "chairs").labels.forEach((label, face) => {
+        const of = votes.get(label) ?? votes.set(label, new Map()).get(label);
+        of.set(known[face], (of.get(known[face]) ?? 0) + 1);
+      });
+    }
+    const most = [...votes].map(([label, of]) => [label, ...[...of].sort((a, b) => b[1] - a[1])[0]]);
+    const given = new Set();
+    for (const [label, part] of most.sort((a, b) => b[2] - a[2])) {
+      // What is between the legs counts as leg there, but may have a label of its own.
+      const name = given.has(truth[part]) ? `${truth[part]} too`.replace("leg too", "stretcher") : truth[part];
+      given.add(name);
+      coseg("name", String(label), name, "--collection", "chairs");
+    }
+    const [, second, third] = coseg("ls", "--collection", "chairs").shapes.map((s) => s.name);
+    const page = await open(`${url}#chairs`, { width: 1280, height: 520 });
+    await shot(page, "gallery");
+    await page.setViewportSize({ width: 1280, height: 760 });
+    await select(page, second);
+    await page.waitForSelector(".near canvas[data-drawn]");
+    await page.mouse.move(0, 0);
+    await shot(page, "shape");
+    await page.click("#theme");
+    await select(page, third);
+    await mode(page, third, "eigen");
+    await page.locator("#controls input[type=range]").fill("5");
+    await page.waitForFunction(() => document.querySelector("#controls output").textContent.startsWith("6,"));
+    await page.waitForTimeout(300);
+    await shot(page, "eigenfunction");
+    await mode(page, third, "map");
+    await page.waitForSelector("canvas.heat");
+    await page.waitForTimeout(300);
+    await shot(page, "map");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
 } else if (what === "empty") {
   await test("an empty library says what to do", async () => {
     const page = await open(url);

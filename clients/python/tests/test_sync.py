@@ -108,13 +108,27 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert np.abs(pulled - fmap.c_12).max() < 0.05
     assert fmap.quality.coverage > 0
     assert fmap.quality.expected_error is None
+    assert fmap.confidence is not None and fmap.confidence.shape == fmap.matched.shape == (n_b,)
+    assert np.all(fmap.confidence[~fmap.matched] == 0) and fmap.alternative is None
+    assert fmap.agreement is None and 0 < (fmap.quality.confidence or 0) < 1
+    agreement = chairs.map(a, b, agreement=True).agreement
+    assert agreement is not None and (agreement.n_triangles > 1 or not agreement.inconsistent)
     # One for points, and what it carries: constants, and labels as good as those that are there.
     dense = chairs.library.map(a, b, "chairs", points=True)
     assert dense.p2p_21.shape == (n_b,) and 0 < (dense.quality.expected_error or 0) < 1
+    turned = chairs.map(a, b, orientation="reverse", k=30, alternative=True)
+    assert turned.c_12.shape == (30, 30) and (turned.quality.orientation or 0) < 0
+    other = turned.alternative
+    assert other is not None and other.c_12.shape == (30, 30) and (other.quality.orientation or 0) > 0
+    assert turned.alternative_cost is not None and other.p2p_21.shape == (n_b,)
+    with pytest.raises(ValueError, match="orientation is 'left'"):
+        chairs.map(a, b, orientation="left")
     pinned = chairs.map(a, b, landmarks=[(int(dense.p2p_21[0]), 0)])
     assert pinned.quality.expected_error is not None
     n_faces = len(chairs.labels(a)), len(chairs.labels(b))
-    ones = chairs.transfer(np.ones((n_faces[0], 2)), a, b)
+    both = chairs.transferred(np.ones((n_faces[0], 2)), a, b)
+    ones = both.values
+    assert both.quality.expected_error == dense.quality.expected_error
     assert ones.shape == (n_faces[1], 2) and np.allclose(ones, 1)
     voted = chairs.transfer(chairs.labels(a), a, b)
     assert voted.dtype == np.int32 and (voted == chairs.labels(b)).mean() > 0.5

@@ -11,6 +11,8 @@
 
 export type { Item } from "./batch.js";
 export * from "./errors.js";
-export * from "./library.js";
+export { Collection, reachable } from "./collection.js";
+export { defaultEndpoint, Library } from "./library.js";
 export { curveFromEnv, curveFromFiles, type Curve } from "./transport.js";
+export type * from "./types.js";
 export type { Arrays, Encoded, Matrix, Mesh, Plain } from "./wire.js";

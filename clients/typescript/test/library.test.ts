@@ -90,6 +90,12 @@ test("spectra and maps are arrays", async () => {
   assert.equal(map.c12.data.length, map.c12.shape[0]! * map.c12.shape[1]!);
   assert.ok(map.p2p21.every((v) => v < n!));
   assert.ok(map.quality.coverage > 0);
+  assert.equal(map.matched.length, map.confidence!.length);
+  const { agreement } = await chairs.map(a, b, { agreement: true });
+  assert.ok(agreement!.nTriangles > 1 || !agreement!.inconsistent);
+  const turned = await chairs.map(a, b, { orientation: "reverse", k: 30, alternative: true });
+  assert.ok(turned.quality.orientation! < 0 && turned.alternative!.quality.orientation! > 0);
+  assert.ok(turned.alternativeCost! > 0 && turned.alternative!.c12.shape[0] === 30);
   const dense = await lib.map(a, b, "chairs", { landmarks: [[map.p2p21[0]!, 0]] });
   assert.ok(dense.quality.expectedError! > 0 && map.quality.expectedError === undefined);
   const ones = await chairs.transfer(new Float32Array((await chairs.labels(a)).length).fill(1), a, b);

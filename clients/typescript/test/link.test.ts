@@ -3,7 +3,7 @@ import { test } from "node:test";
 import { create, toBinary } from "@bufbuild/protobuf";
 import { BadReply, NoAnswer } from "../src/errors.js";
 import { ReplySchema } from "../src/gen/coseg/v1/message_pb.js";
-import { reachable } from "../src/library.js";
+import { reachable } from "../src/collection.js";
 import { Link, RESEND_MS } from "../src/link.js";
 
 const hello = (instance: string, requestId = "?1") =>

@@ -55,7 +55,12 @@ pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes])
             }
             None => {
                 let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
-                Reply::GetFunctionalMap(convert::functional_map(&map, &mut frames))
+                let mut reply = convert::functional_map(&map, &mut frames);
+                if r.agreement {
+                    let standing = library.standing(&r.collection, &r.from, &r.to, &map);
+                    reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
+                }
+                Reply::GetFunctionalMap(reply)
             }
         },
         Body::TransferFunction(r) => {

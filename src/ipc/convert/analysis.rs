@@ -1,6 +1,7 @@
 //! Arrays of descriptions, maps between shapes.
 
 use super::errors::{field_error, frame_error};
+use crate::fmap::consistency::Standing;
 use crate::fmap::{PointMap, Quality, Side};
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::wire::{self, ErrorReason};
@@ -170,6 +171,15 @@ pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunct
         matched: Some(matched(at.iter().map(Option::is_some), frames)),
         confidence: Some(frames.f32_array(&confidence, &[n])),
         ..wire::GetFunctionalMapReply::default()
+    }
+}
+
+/// How a map agrees with the others of its collection.
+pub fn agreement(standing: Standing) -> wire::MapAgreement {
+    wire::MapAgreement {
+        n_triangles: u32::try_from(standing.n_triangles).unwrap_or(u32::MAX),
+        departure: standing.departure,
+        inconsistent: standing.inconsistent,
     }
 }
 

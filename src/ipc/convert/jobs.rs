@@ -236,6 +236,7 @@ fn placed(p: &Placed) -> wire::Placed {
         sequence: p.sequence,
         n_maps: p.n_maps,
         n_relabelled: p.n_relabelled,
+        n_inconsistent: p.n_inconsistent,
         stages: stages.collect(),
     }
 }

@@ -214,11 +214,23 @@ fn gltf_errors_name_the_place_and_the_value() {
         ),
         (
             message(r#"{"children":[7]}"#, SQUARE, "", ""),
-            "nodes[0].children[0] names an entry that is not there".into(),
+            "nodes[0].children[0] names node 7, but the file has 1".into(),
+        ),
+        (
+            message(NODE, r#"{"attributes":{"POSITION":0},"indices":6}"#, "", ""),
+            "meshes[0].primitives[0].indices names accessor 6, but the file has 2".into(),
+        ),
+        (
+            message(NODE, r#"{"attributes":{"POSITION":0},"material":0}"#, "", ""),
+            "meshes[0].primitives[0].material names material 0, but the file has 0".into(),
+        ),
+        (
+            message(NODE, r#"{"attributes":{"POSITION":0},"mode":9}"#, "", ""),
+            "meshes[0].primitives[0].mode is 9, which glTF does not know".into(),
         ),
         (
             message(r#"{"mesh":2}"#, SQUARE, "", ""),
-            "nodes[0].mesh names an entry that is not there".into(),
+            "nodes[0].mesh names mesh 2, but the file has 1".into(),
         ),
         (
             message(NODE, r#"{"attributes":{"POSITION":9}}"#, "", ""),
@@ -264,11 +276,11 @@ fn gltf_errors_name_the_place_and_the_value() {
         ),
         (
             r#""bufferView":8,"componentType":5126,"count":5,"type":"VEC3""#,
-            "accessors[2].bufferView names an entry that is not there",
+            "accessors[2].bufferView names buffer view 8, but the file has 4",
         ),
         (
             r#""bufferView":0,"componentType":77,"count":4,"type":"VEC3""#,
-            "accessors[2].componentType has a value that glTF does not know",
+            "accessors[2].componentType is 77, which glTF does not know",
         ),
         (
             r#""componentType":5126,"count":4,"type":"VEC3","sparse":{"count":5,"indices":{"bufferView":2,

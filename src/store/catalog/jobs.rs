@@ -42,6 +42,17 @@ impl Reader<'_> {
         )
     }
 
+    /// One item of a job.
+    pub fn job_item(&self, job: u64, index: u32) -> Result<Option<JobItemRow>> {
+        let Some(job) = self.job(job)? else {
+            return Ok(None);
+        };
+        let tail = "WHERE job_id = ?1 AND idx = ?2";
+        self.first(&JOB_ITEMS, tail, params![job.id, index], |fields| {
+            item_row(fields, job.collection.clone())
+        })
+    }
+
     /// Jobs before `before`, newest first, at most `limit`: all, or those of which an item failed; of all
     /// collections, or of one.
     pub fn jobs(

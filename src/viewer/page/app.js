@@ -16,7 +16,6 @@ class App {
     this.labels = new Map();
     this.shapes = [];
     this.cache = new Map();
-    this.begin = performance.now();
     this.thumbnails = new Thumbnails(this);
     this.gallery = new Gallery(this);
     this.stage = new Stage(this);
@@ -142,10 +141,10 @@ class App {
       }
       if (first) this.restore();
       first = false;
-      // Draw before the next batch is read.
-      await new Promise((resolve) => setTimeout(resolve));
+      // Draw what is in sight before the next batch is read.
+      await this.thumbnails.idle();
     }
-    document.documentElement.dataset.loadedMs = Math.round(performance.now() - this.begin);
+    document.documentElement.dataset.loadedMs = Math.round(performance.now());
     this.loaded = true;
     this.thumbnailsDrawn();
     if (!this.selected) this.restore();
@@ -165,13 +164,13 @@ class App {
     else this.empty();
   }
 
-  /** All pictures that are in sight are there. */
+  /** Notes when all pictures that are in sight are there: milliseconds since the page was asked for. */
   thumbnailsDrawn() {
     const root = document.documentElement;
     const inSight = [...this.gallery.cards.values()].filter((c) => c.inSight);
     const someShown = inSight.length > 0 || this.found.length === 0 || this.gallery.root.clientHeight === 0;
     if (!someShown || !inSight.every((c) => c.firstChild.dataset.drawn)) return;
-    root.dataset.visibleMs ??= Math.round(performance.now() - this.begin);
+    root.dataset.visibleMs ??= Math.round(performance.now());
     if (this.loaded) root.dataset.ready = "true";
   }
 
@@ -296,6 +295,8 @@ class App {
     this.stage.painted.clear();
     this.stage.mode = mode;
     this.showMode();
+    // The functional map is at the top of it.
+    if (mode === "map") this.panel.root.scrollTop = 0;
     await this.stage.setMode(mode);
   }
 

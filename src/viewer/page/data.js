@@ -38,12 +38,17 @@ function column(array, at) {
   return out;
 }
 
+/** Bytes that are written in base 64. */
+function bytesOf(text) {
+  if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
+  const words = atob(text);
+  const bytes = new Uint8Array(words.length);
+  for (let i = 0; i < words.length; i++) bytes[i] = words.charCodeAt(i);
+  return bytes;
+}
+
 async function unpacked(element) {
-  const text = element.textContent;
-  const bytes = Uint8Array.fromBase64
-    ? Uint8Array.fromBase64(text)
-    : Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const stream = new Blob([bytesOf(element.textContent)]).stream().pipeThrough(new DecompressionStream("gzip"));
   return readPack(await new Response(stream).arrayBuffer());
 }
 

@@ -85,33 +85,34 @@ class View {
     return [size / width, size / height];
   }
 
-  /** Pixels from the upper left corner of the box, and nearness, of a point of the shape. */
-  project(x, y, z) {
+  /** Of each point of the shape (x, y, z) pixels from the upper left corner of the box, and nearness. */
+  project(points) {
     const t = this.turn;
-    const px = t[0] * x + t[1] * y + t[2] * z;
-    const py = t[3] * x + t[4] * y + t[5] * z;
-    const pz = t[6] * x + t[7] * y + t[8] * z;
-    const w = 1 - 0.2 * pz;
     const [sx, sy] = this.scale;
     const [, , width, height] = this.box;
-    return [
-      ((px * sx) / w + this.pan[0] + 1) * 0.5 * width,
-      (1 - ((py * sy) / w + this.pan[1])) * 0.5 * height,
-      pz,
-    ];
+    const [panX, panY] = this.pan;
+    const out = new Float32Array(points.length);
+    for (let i = 0; i < points.length; i += 3) {
+      const [x, y, z] = [points[i], points[i + 1], points[i + 2]];
+      const near = t[6] * x + t[7] * y + t[8] * z;
+      const w = 1 - 0.2 * near;
+      out[i] = (((t[0] * x + t[1] * y + t[2] * z) * sx) / w + panX + 1) * 0.5 * width;
+      out[i + 1] = (1 - (((t[3] * x + t[4] * y + t[5] * z) * sy) / w + panY)) * 0.5 * height;
+      out[i + 2] = near;
+    }
+    return out;
   }
 
   /** Fills the box with a mesh as it is seen now. */
   fit(mesh) {
     [this.zoom, this.pan] = [1, [0, 0]];
-    const p = mesh.positions;
+    const seen = this.project(mesh.positions);
     let [left, right, top, bottom] = [Infinity, -Infinity, Infinity, -Infinity];
-    for (let i = 0; i < p.length; i += 3) {
-      const [x, y] = this.project(p[i], p[i + 1], p[i + 2]);
-      left = Math.min(left, x);
-      right = Math.max(right, x);
-      top = Math.min(top, y);
-      bottom = Math.max(bottom, y);
+    for (let i = 0; i < seen.length; i += 3) {
+      left = Math.min(left, seen[i]);
+      right = Math.max(right, seen[i]);
+      top = Math.min(top, seen[i + 1]);
+      bottom = Math.max(bottom, seen[i + 1]);
     }
     const [, , width, height] = this.box;
     this.zoom = Math.min(width / (right - left || 1), height / (bottom - top || 1)) * 0.92;

@@ -5,8 +5,8 @@
  * pictures in it, so there should be few.
  */
 const BUDGET_MS = 150;
-/** Pictures that are drawn at once, in rows of so many. */
-const COLUMNS = 4;
+/** Milliseconds for which reading waits for drawing. */
+const PATIENCE_MS = 500;
 const $ = (id) => document.getElementById(id);
 
 /** An element with properties, attributes (`aria-…`, `data-…`, `role`) and children; strings become text. */
@@ -28,11 +28,11 @@ const swatch = (colour) => {
 const percent = (share) =>
   share > 0 && share < 0.0005 ? "< 0.1 %" : `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)} %`;
 
-/** Draws small pictures of shapes, a few in each frame, those in sight first. */
+/** Draws small pictures of shapes, some in each frame, in the order in which they were asked for. */
 class Thumbnails {
   constructor(app) {
     this.app = app;
-    this.renderer = new Renderer(document.createElement("canvas"));
+    this.raster = new Raster();
     this.waiting = new Map();
     this.running = false;
   }
@@ -44,64 +44,53 @@ class Thumbnails {
     requestAnimationFrame(() => this.frame());
   }
 
-  /** Draws as many as a frame has time for, side by side on one canvas: copying from it is what costs most. */
   frame() {
     const begin = performance.now();
-    const batch = [];
+    // Sizes first: asking for one after a canvas has changed would lay the page out again.
+    const sizes = new Map([...this.waiting.keys()].map((canvas) => [canvas, this.size(canvas)]));
     for (const [canvas, name] of this.waiting) {
       this.waiting.delete(canvas);
       const portrait = this.app.portraits.get(name);
-      if (portrait && canvas.isConnected) batch.push({ canvas, portrait, ...this.size(canvas) });
-      if (batch.length === COLUMNS * COLUMNS) break;
-    }
-    if (batch.length > 0) {
-      const { renderer } = this;
-      const width = Math.max(...batch.map((b) => b.width));
-      const height = Math.max(...batch.map((b) => b.height));
-      const size = [width * COLUMNS, height * COLUMNS];
-      if (renderer.canvas.width !== size[0] || renderer.canvas.height !== size[1])
-        [renderer.canvas.width, renderer.canvas.height] = size;
-      renderer.clear();
-      let n = 0;
-      do {
-        this.draw(batch[n], [(n % COLUMNS) * width, Math.floor(n / COLUMNS) * height]);
-        n++;
-      } while (n < batch.length && performance.now() - begin < BUDGET_MS);
-      for (const { canvas, portrait, place, width, height } of batch.slice(0, n)) {
-        [canvas.width, canvas.height] = [width, height];
-        canvas.getContext("2d").drawImage(renderer.canvas, ...place, width, height, 0, 0, width, height);
-        canvas.dataset.drawn = portrait.version;
+      try {
+        if (portrait && canvas.isConnected) this.draw(canvas, portrait, sizes.get(canvas));
+      } catch (error) {
+        // The others are drawn all the same.
+        console.error(name, error);
       }
-      // The others again, before those that came later.
-      const later = [...this.waiting];
-      this.waiting = new Map([...batch.slice(n).map((b) => [b.canvas, b.portrait.name]), ...later]);
+      if (performance.now() - begin > BUDGET_MS) break;
     }
     this.running = this.waiting.size > 0;
     if (this.running) requestAnimationFrame(() => this.frame());
-    else this.app.thumbnailsDrawn();
+    else this.rested();
+  }
+
+  rested() {
+    this.app.thumbnailsDrawn();
+    this.atRest?.();
+  }
+
+  /** Resolves when nothing waits to be drawn; soon where nothing is drawn at all, as in a page that nobody sees. */
+  idle() {
+    if (!this.running) return new Promise((resolve) => setTimeout(resolve));
+    return new Promise((resolve) => {
+      this.atRest = resolve;
+      setTimeout(resolve, PATIENCE_MS);
+    });
   }
 
   /** Pixels of a picture. */
   size(canvas) {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    return {
-      width: Math.max(Math.round(canvas.clientWidth * ratio), 16),
-      height: Math.max(Math.round(canvas.clientHeight * ratio), 16),
-    };
+    return [canvas.clientWidth, canvas.clientHeight].map((n) => Math.max(Math.round(n * ratio), 16));
   }
 
-  draw(entry, place) {
-    const { renderer, app } = this;
-    const { portrait, width, height } = entry;
-    entry.place = place;
-    const mesh = new Mesh(portrait, app.up);
-    const view = new View();
-    view.box = [...place, width, height];
-    view.fit(mesh);
-    const uploaded = renderer.upload(mesh);
-    renderer.update(uploaded, "colour", faceColours(mesh.nFaces, (f) => app.shownColour(mesh.labels[f])));
-    renderer.draw(uploaded, view, { lines: 0.9 });
-    renderer.remove(uploaded);
+  draw(canvas, portrait, [width, height]) {
+    const { app, raster } = this;
+    const picture = raster.picture(new Mesh(portrait, app.up), (label) => app.shownColour(label), width, height);
+    [canvas.width, canvas.height] = [width, height];
+    // In memory: a picture that comes from there is not to travel by way of an emulated graphics card.
+    canvas.getContext("2d", { willReadFrequently: true }).putImageData(picture, 0, 0);
+    canvas.dataset.drawn = portrait.version;
   }
 }
 

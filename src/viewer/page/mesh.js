@@ -37,13 +37,15 @@ class Mesh {
     this.kind = portrait.kind;
     const raw = numbers(portrait.positions);
     const { rows, middle } = uprightBasis(raw, up);
-    const n = raw.length / 3;
     const at = new Float32Array(raw.length);
     let radius = 1e-12;
-    for (let v = 0; v < n; v++) {
-      const p = [raw[3 * v] - middle[0], raw[3 * v + 1] - middle[1], raw[3 * v + 2] - middle[2]];
-      for (let i = 0; i < 3; i++) at[3 * v + i] = dot(rows[i], p);
-      radius = Math.max(radius, dot(p, p));
+    const [right, above, front] = rows;
+    for (let v = 0; v < raw.length; v += 3) {
+      const x = raw[v] - middle[0], y = raw[v + 1] - middle[1], z = raw[v + 2] - middle[2];
+      at[v] = right[0] * x + right[1] * y + right[2] * z;
+      at[v + 1] = above[0] * x + above[1] * y + above[2] * z;
+      at[v + 2] = front[0] * x + front[1] * y + front[2] * z;
+      radius = Math.max(radius, x * x + y * y + z * z);
     }
     radius = Math.sqrt(radius);
     for (let i = 0; i < at.length; i++) at[i] /= radius;
@@ -136,8 +138,10 @@ class Mesh {
       }
       const length = Math.hypot(sx, sy, sz);
       const unit = length > 1e-30 ? 127 / length : 0;
-      if (unit) normal.set([sx * unit, sy * unit, sz * unit], 4 * c);
-      else normal.set([(nx / lengths[f]) * 127, (ny / lengths[f]) * 127, (nz / lengths[f]) * 127], 4 * c);
+      const own = 127 / lengths[f];
+      normal[4 * c] = unit ? sx * unit : nx * own;
+      normal[4 * c + 1] = unit ? sy * unit : ny * own;
+      normal[4 * c + 2] = unit ? sz * unit : nz * own;
       const p = 3 * faces[c];
       place[3 * c] = positions[p];
       place[3 * c + 1] = positions[p + 1];
@@ -162,12 +166,7 @@ class Mesh {
   /** The face seen at a place of the screen, with the point on it; `view` as in the picture. */
   pick(view, x, y) {
     const { positions: p, faces, nFaces } = this;
-    const n = p.length / 3;
-    const screen = new Float32Array(3 * n);
-    for (let v = 0; v < n; v++) {
-      const [sx, sy, depth] = view.project(p[3 * v], p[3 * v + 1], p[3 * v + 2]);
-      screen.set([sx, sy, depth], 3 * v);
-    }
+    const screen = view.project(p);
     let best = null;
     for (let f = 0; f < nFaces; f++) {
       const [a, b, c] = [3 * faces[3 * f], 3 * faces[3 * f + 1], 3 * faces[3 * f + 2]];

@@ -164,7 +164,9 @@ class Panel {
       ? [["area of the source that is hit", percent(q.coverage)],
          ["off an isometry, ‖CᵀC − I‖/√k", q.orthogonality.toFixed(2)],
          ["entries near zero", percent(q.near_zero)],
-         ["descriptor residual", q.descriptor_residual.toPrecision(3)]]
+         ["descriptor residual", q.descriptor_residual.toPrecision(3)],
+         ["area that something matches", percent(q.matched)],
+         ["carried labels expected to be right", percent(q.confidence)]]
       : [];
     this.mapBox.replaceChildren(
       make("h3", {}, "Functional map"), canvas,

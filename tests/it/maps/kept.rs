@@ -111,6 +111,14 @@ fn a_planted_wrong_map_is_found_and_made_anew() {
     assert!(notes.iter().all(|f| !f.damage), "{notes:?}");
     let place = format!("maps {}, {}", row.from, row.to);
     assert!(notes.iter().any(|f| f.place == place), "{notes:?}");
+    let library = Library::open(folder.path()).unwrap();
+    let standing = |from: &str, to: &str| {
+        let map = library.map(COLLECTION, from, to).unwrap();
+        library.standing(COLLECTION, from, to, &map).unwrap()
+    };
+    let told = standing(names.0, names.1).unwrap();
+    assert!(told.inconsistent && told.departure > 0.5, "{told:?}");
+    drop(library);
     let repaired = Library::repair(folder.path()).unwrap();
     let told = format!("{} to {}: made anew", names.0, names.1);
     let done = repaired.done.iter().find(|d| d.contains(&told));
@@ -130,6 +138,8 @@ fn a_planted_wrong_map_is_found_and_made_anew() {
         .filter(|(x, y)| x == y)
         .count();
     println!("{same} of {} vertices as before", row.p2p_21.len());
+    let standing = library.standing(COLLECTION, names.0, names.1, &map);
+    assert!(!standing.unwrap().unwrap().inconsistent);
     assert!(map.quality.confidence > 0.6, "{:?}", map.quality);
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
     let after = super::super::pipeline::all_labels(&library);

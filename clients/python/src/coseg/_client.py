@@ -134,6 +134,12 @@ class Library:
         reply, _ = self.call("stats")
         return wire.plain(reply)
 
+    def drain(self) -> int:
+        """Stops the daemon when the work in hand is done; only over ``ipc``. How many accepted shapes are
+        not placed yet: those not begun are resumed at the next start."""
+        reply, _ = self.call("drain")
+        return int(reply.n_queued)
+
     # -- collections ----------------------------------------------------------------------------
 
     def collections(self) -> list[t.CollectionInfo]:
@@ -176,14 +182,12 @@ class Library:
         source: str,
         target: str,
         collection: str | None = None,
-        *,
-        points: bool = False,
-        landmarks: Iterable[tuple[int, int]] = (),
+        **options: Any,
     ) -> t.FunctionalMap:
         """The functional map that carries functions on ``source`` to functions on ``target``. The
-        collection need not be named if there is only one."""
+        collection need not be named if there is only one; options are those of its ``map``."""
         within = self.collection(collection) if collection else self.only_collection()
-        return within.map(source, target, points=points, landmarks=landmarks)
+        return within.map(source, target, **options)
 
     # -- jobs -----------------------------------------------------------------------------------
 
@@ -224,11 +228,11 @@ class Library:
                 return
             before = reply.jobs[-1].job_id
 
-    def retry(self, job_id: int) -> t.Job:
+    def retry(self, job_id: int) -> t.RetriedJob:
         """Queues the failed shapes of a job again, once what made them fail is mended. With keys that
         needs the role ``admin``."""
         reply, _ = self.call("retry_job", job_id=job_id)
-        return wire.job(reply.job)
+        return wire.retried(reply)
 
 
 class Collection:
@@ -415,6 +419,13 @@ class Collection:
         """Removes a shape."""
         self._call("remove_shape", shape=name)
 
+    def portraits(self, names: Sequence[str], *, detail: str = "proxy") -> bytes:
+        """At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes:
+        ``"proxy"``, ``"surface"`` or ``"functions"``."""
+        value = wire.portrait_detail(detail)
+        reply, raw = self._call("get_portraits", shapes=names, detail=value)
+        return raw.file(reply.pack)
+
     # -- analysis -------------------------------------------------------------------------------
 
     def spectrum(self, name: str, *, eigenvectors: bool = False) -> t.Spectrum:
@@ -434,21 +445,34 @@ class Collection:
         return wire.descriptors(reply, raw)
 
     def map(
-        self, source: str, target: str, *, points: bool = False, landmarks: Iterable[tuple[int, int]] = ()
+        self,
+        source: str,
+        target: str,
+        *,
+        agreement: bool = False,
+        points: bool = False,
+        landmarks: Iterable[tuple[int, int]] = (),
+        orientation: str | None = None,
+        k: int = 0,
+        alternative: bool = False,
     ) -> t.FunctionalMap:
         """The functional map that carries functions on ``source`` to functions on ``target``, and the
         pointwise map, which goes the other way.
 
-        By default it is the map by which labels are carried, which is kept. With ``points`` it is made
-        for points, now, in about 0.1 s, and its quality has the error to expect; ``landmarks`` are
-        pairs of vertices of the working meshes that correspond.
+        By default it is the map by which labels are carried, which is kept; ``agreement`` says how it
+        agrees with the other kept maps. With ``points``, or any option after it, it is made for points,
+        now, in about 0.1 s, and its quality has the error to expect; ``landmarks`` are pairs of vertices
+        of the working meshes that correspond, ``orientation`` is ``"keep"`` or ``"reverse"`` (without:
+        the one that keeps it, unless that is much worse), ``k`` the size of ``c_12`` (without: 100), and
+        ``alternative`` asks for the best map of the other orientation too.
         """
         # `from` is a word of the language.
         fields: dict[str, Any] = {"from": source, "to": target}
-        if pairs := _landmarks(landmarks):
-            points = True
-        if points:
-            fields["points"] = {"landmarks": pairs}
+        asked = _point_options(landmarks, orientation, k, alternative)
+        if points or asked:
+            fields["points"] = asked
+        if agreement:
+            fields["agreement"] = True
         reply, raw = self._call("get_functional_map", **fields)
         return wire.functional_map(source, target, reply, raw)
 
@@ -459,19 +483,35 @@ class Collection:
         target: str,
         *,
         landmarks: Iterable[tuple[int, int]] = (),
+        orientation: str | None = None,
+        k: int = 0,
     ) -> np.ndarray[Any, Any]:
         """Carries values at the faces of ``source`` to those of ``target``, by a map between points:
-        integers ``(n,)`` are voted on, numbers ``(n, …)`` averaged."""
+        integers ``(n,)`` are voted on, numbers ``(n, …)`` averaged. Options are those of :meth:`map`."""
+        options: dict[str, Any] = {"landmarks": landmarks, "orientation": orientation, "k": k}
+        return (self.transferred(values, source, target, **options)).values
+
+    def transferred(
+        self,
+        values: ArrayLike,
+        source: str,
+        target: str,
+        *,
+        landmarks: Iterable[tuple[int, int]] = (),
+        orientation: str | None = None,
+        k: int = 0,
+    ) -> t.Transferred:
+        """What :meth:`transfer` gives, with the quality of the map."""
         array, writer = np.asarray(values), FrameWriter()
         if array.dtype.kind in "iu":
             ref = writer.array(_integers(array, np.int32, "values"))
         else:
             ref = writer.array(array.astype(np.float32).reshape(len(array), -1))
         fields: dict[str, Any] = {"from": source, "to": target, "values": ref}
-        fields["points"] = {"landmarks": _landmarks(landmarks)}
+        fields["points"] = _point_options(landmarks, orientation, k, False)
         reply, raw = self._call("transfer_function", writer.frames, **fields)
         carried: np.ndarray[Any, Any] = raw.array(reply.values)
-        return carried.reshape(-1, *array.shape[1:])
+        return t.Transferred(carried.reshape(-1, *array.shape[1:]), wire.map_quality(reply.quality))
 
     def match_parts(self, a: str, b: str) -> t.PartMatches:
         """Which part of ``a`` matches which part of ``b``."""
@@ -516,15 +556,15 @@ class Collection:
         reply, _ = self._call("name_label", label=label, name=name)
         return wire.label(reply.label)
 
-    def merge(self, label: int, into: int) -> t.Label:
+    def merge(self, label: int, into: int) -> t.ChangedLabel:
         """Makes one label of two: faces of ``label`` carry ``into`` from now on."""
         reply, _ = self._call("merge_labels", label=label, into=into)
-        return wire.label(reply.label)
+        return wire.changed_label(reply)
 
-    def split(self, label: int) -> t.Label:
+    def split(self, label: int) -> t.ChangedLabel:
         """Makes two labels of one, and returns the new one."""
         reply, _ = self._call("split_label", label=label)
-        return wire.label(reply.label)
+        return wire.changed_label(reply)
 
     def undo(self) -> t.Undone:
         """Takes back the newest correction, name, merge or split."""
@@ -616,8 +656,18 @@ class Collection:
                     raise
 
 
-def _landmarks(pairs: Iterable[tuple[int, int]]) -> list[dict[str, int]]:
-    return [{"from": int(source), "to": int(target)} for source, target in pairs]
+def _point_options(
+    landmarks: Iterable[tuple[int, int]], orientation: str | None, k: int, alternative: bool
+) -> dict[str, Any]:
+    """What is asked of a map between points; nothing if all is as usual."""
+    pairs = [{"from": int(source), "to": int(target)} for source, target in landmarks]
+    asked = {
+        "landmarks": pairs,
+        "orientation": wire.orientation(orientation),
+        "k": k,
+        "alternative": alternative,
+    }
+    return {name: value for name, value in asked.items() if value}
 
 
 def _integers(values: ArrayLike, dtype: type[np.generic], what: str) -> np.ndarray[Any, Any]:

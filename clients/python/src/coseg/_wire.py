@@ -19,10 +19,12 @@ from coseg.v1 import (
     analysis_pb2,
     array_pb2,
     collection_pb2,
+    correction_pb2,
     daemon_pb2,
     event_pb2,
     job_pb2,
     message_pb2,
+    portrait_pb2,
     shape_pb2,
 )
 
@@ -208,9 +210,17 @@ def up_name(value: int) -> str:
     return name.replace("plus_", "+").replace("minus_", "-")
 
 
+def changed_label(reply: correction_pb2.MergeLabelsReply | correction_pb2.SplitLabelReply) -> t.ChangedLabel:
+    """A label after a merge or a split."""
+    return t.ChangedLabel(**vars(label(reply.label)), n_changed=reply.n_shapes)
+
+
 def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
     """A collection."""
     spec = message.spec
+    estimate = None
+    if message.HasField("up_estimate"):
+        estimate = t.UpEstimate(up_name(message.up_estimate.up), message.up_estimate.agreement)
     return flat(
         t.CollectionInfo,
         message,
@@ -220,7 +230,13 @@ def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
         operator=enum_name(collection_pb2.Operator, "OPERATOR_", spec.operator).replace("_", "-"),
         working_faces=spec.working_faces,
         labels=tuple(map(label, message.labels)),
+        up_estimate=estimate,
     )
+
+
+def portrait_detail(name: str) -> Any:
+    """What a portrait shows of a shape."""
+    return _value(portrait_pb2.PortraitDetail, f"PORTRAIT_DETAIL_{name.upper()}", f"detail is {name!r}")
 
 
 def collection_spec(
@@ -269,17 +285,25 @@ def item(message: job_pb2.JobItem) -> t.JobItem:
             sequence=placed.sequence,
             n_maps=placed.n_maps,
             n_relabelled=placed.n_relabelled,
+            n_inconsistent=placed.n_inconsistent,
             stages={s.stage: s.ms for s in placed.stages},
         )
     elif state in ("failed", "cancelled"):
         error = Refused.from_wire(message.error) if message.HasField("error") else None
         result = t.Added(message.name, state, error=error)
-    return t.JobItem(message.name, state, message.stage, result)
+    return t.JobItem(message.index, message.name, state, message.stage, result, message.attempts)
 
 
 def job(message: job_pb2.Job) -> t.Job:
     """A job."""
-    return flat(t.Job, message, id=message.job_id, items=tuple(map(item, message.items)))
+    carrying = flat(t.Carrying, message.carrying) if message.HasField("carrying") else None
+    items = tuple(map(item, message.items))
+    return flat(t.Job, message, id=message.job_id, items=items, carrying=carrying)
+
+
+def retried(reply: job_pb2.RetryJobReply) -> t.RetriedJob:
+    """A job whose failed shapes were queued again."""
+    return t.RetriedJob(**vars(job(reply.job)), n_queued=reply.n_queued)
 
 
 def labelling(reply: shape_pb2.GetLabelsReply, raw: Raw) -> t.Labelling:
@@ -311,16 +335,44 @@ def descriptors(reply: analysis_pb2.GetDescriptorsReply, raw: Raw) -> t.Descript
 
 def map_quality(message: analysis_pb2.MapQuality) -> t.MapQuality:
     """How good a map is."""
-    expected = message.expected_error if message.HasField("expected_error") else None
-    return flat(t.MapQuality, message, expected_error=expected)
+    return t.MapQuality(**plain(message))  # type: ignore[arg-type]
 
 
 def functional_map(
     source: str, target: str, reply: analysis_pb2.GetFunctionalMapReply, raw: Raw
 ) -> t.FunctionalMap:
     """A functional map."""
-    quality = map_quality(reply.quality)
-    return t.FunctionalMap(source, target, raw.array(reply.c_12), raw.array(reply.p2p_21), quality)
+    alternative = None
+    if reply.HasField("alternative_c_12"):
+        alternative = t.FunctionalMap(
+            source,
+            target,
+            raw.array(reply.alternative_c_12),
+            raw.array(reply.alternative_p2p_21),
+            map_quality(reply.alternative_quality),
+            raw.array(reply.alternative_matched) != 0,
+        )
+    return t.FunctionalMap(
+        source,
+        target,
+        raw.array(reply.c_12),
+        raw.array(reply.p2p_21),
+        map_quality(reply.quality),
+        raw.array(reply.matched) != 0,
+        confidence=raw.array(reply.confidence) if reply.HasField("confidence") else None,
+        agreement=flat(t.MapAgreement, reply.agreement) if reply.HasField("agreement") else None,
+        alternative=alternative,
+        alternative_cost=reply.alternative_cost if reply.HasField("alternative_cost") else None,
+    )
+
+
+def orientation(name: str | None) -> int:
+    """Which of the maps between shapes that have a reflection: ``keep``, ``reverse``, or, without a name, the
+    one that keeps orientation unless it is much worse."""
+    if name is None:
+        return 0
+    key = f"MAP_ORIENTATION_{name.upper()}"
+    return int(_value(analysis_pb2.MapOrientation, key, f"orientation is {name!r}"))
 
 
 def part_matches(reply: analysis_pb2.GetPartCorrespondenceReply) -> t.PartMatches:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ Int32 = NDArray[np.int32]
 UInt32 = NDArray[np.uint32]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 Element = TypeVar("Element", bound=np.generic)
 
 
@@ -62,6 +63,24 @@ class Label:
 
 
 @dataclass(frozen=True)
+class ChangedLabel(Label):
+    """A label after a merge or a split."""
+
+    #: Shapes whose labels changed at once.
+    n_changed: int
+
+
+@dataclass(frozen=True)
+class UpEstimate:
+    """An estimate of which way is up."""
+
+    #: Such as ``"+y"``; ``"unknown"`` if fewer than half of the shapes agree on one: then none is used.
+    up: str
+    #: Share of the shapes that stand best along the axis that most do; by chance a sixth.
+    agreement: float
+
+
+@dataclass(frozen=True)
 class CollectionInfo:
     """A collection as it stands."""
 
@@ -77,6 +96,8 @@ class CollectionInfo:
     #: Shapes whose labels wait to be recomputed.
     n_stale: int
     labels: tuple[Label, ...]
+    #: With ``up="auto"``, once there are shapes.
+    up_estimate: UpEstimate | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +177,8 @@ class Added:
     n_maps: int = 0
     #: Stored shapes whose labels were recomputed with it.
     n_relabelled: int = 0
+    #: Of the maps those that do not agree with the maps between the shapes they come from.
+    n_inconsistent: int = 0
     #: Milliseconds by stage, in order.
     stages: Mapping[str, float] = field(default_factory=dict)
 
@@ -169,6 +192,8 @@ class Added:
 class JobItem:
     """One shape of a job."""
 
+    #: Position in the job, from 0.
+    index: int
     name: str
     #: ``"queued"``, ``"running"``, ``"done"``, ``"failed"`` or ``"cancelled"``.
     state: str
@@ -176,11 +201,23 @@ class JobItem:
     stage: str
     #: When it is over: what became of it.
     result: Added | None
+    #: How often the work on it ended its worker process so far; after 3 times it has failed.
+    attempts: int
+
+
+@dataclass(frozen=True)
+class Carrying:
+    """How far a correction is carried to the other shapes of its collection."""
+
+    #: Shapes to which it is carried; 0 once a later change has taken its place.
+    n_shapes: int
+    #: Those that wait for it.
+    n_left: int
 
 
 @dataclass(frozen=True)
 class Job:
-    """Shapes that were accepted together."""
+    """Shapes that were accepted together, or a correction that is carried to the other shapes."""
 
     id: int
     collection: str
@@ -190,6 +227,16 @@ class Job:
     finished: bool
     #: Share that is done, 0 to 1.
     progress: float
+    #: Where a correction is carried: how far that is.
+    carrying: Carrying | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetriedJob(Job):
+    """A job whose failed shapes were queued again."""
+
+    #: How many were.
+    n_queued: int
 
 
 @dataclass(frozen=True)
@@ -238,9 +285,37 @@ class MapQuality:
     coverage: float
     #: Share of the entries of C with magnitude below 0.1.
     near_zero: float
+    #: Of maps between points: mean distance between a vertex of the source and where it comes back to, in
+    #: units of the square root of the area.
+    round_trip: float | None = None
+    #: Of maps between points: Dirichlet energy of the carried coordinates over that of the target's own;
+    #: near 1 is smooth, large is torn.
+    smoothness: float | None = None
+    #: Of maps between points: −1 (reverses orientation) to 1 (keeps it).
+    orientation: float | None = None
     #: Of maps between points: the mean geodesic error to expect, in units of the square root of the area,
     #: with a reflection of the whole forgiven.
     expected_error: float | None = None
+    #: Share of the target's area to which something corresponds.
+    matched: float | None = None
+    #: Of maps for parts: mean squared descriptor difference between a vertex of the target and what its
+    #: match is matched with; large where many vertices crowd onto one.
+    descriptor_return: float | None = None
+    #: Of maps for parts: share of the area on which a carried label is expected to be right.
+    confidence: float | None = None
+
+
+@dataclass(frozen=True)
+class MapAgreement:
+    """How a map agrees with those by way of other shapes of its collection."""
+
+    #: Triangles of kept maps that it is part of; of fewer than 2 nothing follows.
+    n_triangles: int
+    #: Median over these of how far the map by way of the third shape is from the direct one; 0: the same,
+    #: 1.4: nothing in common.
+    departure: float
+    #: Whether that is more than can be expected of maps of this collection.
+    inconsistent: bool
 
 
 @dataclass(frozen=True)
@@ -254,11 +329,31 @@ class FunctionalMap:
     #: (n2,) for each vertex of shape 2's working mesh one of shape 1's.
     p2p_21: UInt32
     quality: MapQuality
+    #: (n2,) whether something of shape 1 corresponds to each vertex of shape 2's working mesh.
+    matched: Bool
+    #: Of maps for parts: (n2,) probability that a label carried there is right; 0 where nothing corresponds.
+    confidence: Float32 | None = None
+    #: Of maps for parts, if it was asked for: whether it agrees with the others of the collection.
+    agreement: MapAgreement | None = None
+    #: The best map of the other orientation, left for right, if it was asked for and there is one.
+    alternative: FunctionalMap | None = None
+    #: What that costs over what this one does: near 1, the shapes themselves hardly say which is meant.
+    alternative_cost: float | None = None
 
     def carry(self, values: NDArray[Element]) -> NDArray[Element]:
         """Carries values at vertices of shape 1, (n1, …), to those of shape 2, (n2, …)."""
         carried: NDArray[Element] = values[self.p2p_21]
         return carried
+
+
+@dataclass(frozen=True)
+class Transferred:
+    """Values that were carried from the faces of one shape to those of another."""
+
+    #: One row for each face of the target; −1 or NaN where nothing corresponds.
+    values: np.ndarray[Any, Any]
+    #: How good the map is that carried them.
+    quality: MapQuality
 
 
 @dataclass(frozen=True)
@@ -302,6 +397,8 @@ class Corrected:
     changed_share: float
     #: Shapes to which it is still to be carried.
     n_stale: int
+    #: The job that carries it: ``lib.watch(job_id)`` tells how far it is.
+    job_id: int
 
 
 @dataclass(frozen=True)

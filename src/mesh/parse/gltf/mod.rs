@@ -106,12 +106,12 @@ fn document(text: &[u8]) -> Result<Document, ParseError> {
             instead: "export it without that extension",
         });
     }
-    check(&root)?;
+    check(&root, text)?;
     Ok(Document::from_json_without_validation(root))
 }
 
 /// Refuses indices that lead nowhere and values that glTF does not know, in what the scene is read from.
-fn check(root: &Root) -> Result<(), ParseError> {
+fn check(root: &Root, text: &[u8]) -> Result<(), ParseError> {
     // The crate's own check takes the bounds of positions from accessors that it has not looked for yet.
     let n_accessors = root.accessors.len();
     let primitives = root.meshes.iter().flat_map(|mesh| &mesh.primitives);
@@ -136,21 +136,68 @@ fn check(root: &Root) -> Result<(), ParseError> {
     ];
     let mut first = None;
     root.validate(root, json::Path::new, &mut |path, error| {
-        let why = match error {
-            Invalid::IndexOutOfBounds => "names an entry that is not there",
-            Invalid::Invalid => "has a value that glTF does not know",
-            // Bounds that are missing, extensions: of no account here.
-            _ => return,
-        };
+        // Bounds that are missing, extensions: of no account here.
+        if !matches!(error, Invalid::IndexOutOfBounds | Invalid::Invalid) {
+            return;
+        }
         let path = path();
         let is_bound = [".min", ".max"]
             .iter()
             .any(|end| path.as_str().ends_with(end));
         if first.is_none() && !is_bound && READ.iter().any(|name| path.as_str().starts_with(name)) {
-            first = Some(fault(shown(path.as_str().as_bytes()), why));
+            let is_index = matches!(error, Invalid::IndexOutOfBounds);
+            first = Some((path.as_str().to_owned(), is_index));
         }
     });
-    first.map_or(Ok(()), Err)
+    let Some((path, is_index)) = first else {
+        return Ok(());
+    };
+    let found = value_at(text, &path);
+    let why = match list_of(&path).filter(|_| is_index) {
+        Some((what, list)) => {
+            let n = value_at(text, list).map_or(0, |list| list.as_array().map_or(0, Vec::len));
+            format!(
+                "names {what} {}, but the file has {n}",
+                spelt(found.as_ref())
+            )
+        }
+        None => format!("is {}, which glTF does not know", spelt(found.as_ref())),
+    };
+    Err(fault(shown(path.as_bytes()), why))
+}
+
+/// What an index at a path names, and where these are, by the last word of the path.
+fn list_of(path: &str) -> Option<(&'static str, &'static str)> {
+    let word = path.rsplit('.').next().unwrap_or(path);
+    let word = word.split('[').next().unwrap_or(word);
+    Some(match word {
+        "children" | "nodes" | "skeleton" | "joints" | "node" => ("node", "nodes"),
+        "mesh" => ("mesh", "meshes"),
+        "scene" => ("scene", "scenes"),
+        "buffer" => ("buffer", "buffers"),
+        "bufferView" => ("buffer view", "bufferViews"),
+        "indices" | "attributes" | "targets" => ("accessor", "accessors"),
+        "material" => ("material", "materials"),
+        "skin" => ("skin", "skins"),
+        "camera" => ("camera", "cameras"),
+        _ => return None,
+    })
+}
+
+/// The value at a path such as `nodes[0].children[1]` of a JSON that was read before.
+fn value_at(text: &[u8], path: &str) -> Option<json::Value> {
+    let pointer: String = path
+        .split(['.', '[', ']'])
+        .filter(|step| !step.is_empty())
+        .flat_map(|step| ["/", step.trim_matches('"')])
+        .collect();
+    let whole: json::Value = json::deserialize::from_slice(text).ok()?;
+    whole.pointer(&pointer).cloned()
+}
+
+/// A value as the file has it, cut short.
+fn spelt(value: Option<&json::Value>) -> String {
+    value.map_or_else(|| "nothing".to_owned(), |v| shown(v.to_string().as_bytes()))
 }
 
 /// The scene as it is put together.

@@ -1,0 +1,460 @@
+/** One collection: shapes, labels, analysis, corrections, events. */
+
+import { randomUUID } from "node:crypto";
+import { setTimeout as sleep } from "node:timers/promises";
+import { fromBinary } from "@bufbuild/protobuf";
+import { batches, type Batch, type Item } from "./batch.js";
+import { BadReply, EventLogRewound, NoAnswer, Refused } from "./errors.js";
+import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
+import { EventSchema } from "./gen/coseg/v1/event_pb.js";
+import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
+import { PACE_MS, WAIT_MS, type Library } from "./library.js";
+import { added, failed, functionalMap, job, mapQuality, pointOptions, present } from "./replies.js";
+import type { Subscription } from "./transport.js";
+import type {
+  Added,
+  ChangedLabel,
+  CollectionInfo,
+  Corrected,
+  Descriptors,
+  Event,
+  FunctionalMap,
+  Idle,
+  Job,
+  Label,
+  Labelling,
+  MapOptions,
+  Neighbor,
+  PartMatches,
+  Points,
+  Shape,
+  Snapshot,
+  Spectrum,
+  Suggestion,
+  Transferred,
+  Undone,
+} from "./types.js";
+import { FrameWriter, formatName, plain, type Encoded, type Matrix, type Mesh } from "./wire.js";
+
+/** Silence after which a subscription is made anew; heartbeats come once a second. */
+const SILENCE_MS = 3_000;
+const HEARTBEAT_TOPIC = "\0";
+
+/** One collection of a library; made by {@link Library.collection}. */
+export class Collection {
+  /** @internal */
+  constructor(
+    readonly library: Library,
+    readonly name: string,
+    readonly spec: CollectionSpec,
+  ) {}
+
+  /** As it stands, with its labels. */
+  async info(): Promise<CollectionInfo> {
+    const [{ collection }] = await this.library.call("describeCollection", { collection: this.name });
+    if (collection === undefined) throw new BadReply("a described collection is missing");
+    return plain(collection);
+  }
+
+  /** Deletes the collection with its shapes, labels and events. */
+  async delete(): Promise<void> {
+    await this.library.call("deleteCollection", { collection: this.name });
+  }
+
+  /** Adds a shape and waits until it is labelled. A refusal is thrown. */
+  async add(name: string, mesh: Mesh, options: { replace?: boolean } = {}): Promise<Added> {
+    for await (const added of this.addMany([[name, mesh]], options)) {
+      if (added.error) throw added.error;
+      return added;
+    }
+    throw new BadReply("a finished job without its shape");
+  }
+
+  /** Hands shapes over and returns the ids of their jobs as soon as the daemon has them durably. */
+  async submit(
+    shapes: Iterable<Item> | AsyncIterable<Item>,
+    options: { replace?: boolean; key?: string } = {},
+  ): Promise<bigint[]> {
+    const jobs: bigint[] = [];
+    for await (const [batch, jobId] of this.#send(shapes, { inFlight: 64, ...options })) {
+      if (jobId !== undefined) jobs.push(jobId);
+      const unsent = batch.results.find((r) => r !== undefined);
+      if (unsent) throw unsent.error;
+    }
+    return jobs;
+  }
+
+  /**
+   * Streams shapes in, and yields what became of each, in order. `shapes` is read as needed, and at most
+   * about `inFlight` (64) are under way. One that fails is yielded with its `error`; the others go on.
+   *
+   * A daemon that is restarted gets the same requests again. If *this* program may die and be run again,
+   * give the run a `key`: with the same key and shapes a second run takes up the jobs of the first.
+   */
+  async *addMany(
+    shapes: Iterable<Item> | AsyncIterable<Item>,
+    options: { replace?: boolean; key?: string; inFlight?: number; onProgress?: (job: Job) => void } = {},
+  ): AsyncGenerator<Added> {
+    const inFlight = options.inFlight ?? 64;
+    const underWay: [Batch, bigint | undefined][] = [];
+    let nUnderWay = 0;
+    for await (const [batch, jobId] of this.#send(shapes, { ...options, inFlight })) {
+      const n = batch.request.shapes.length;
+      underWay.push([batch, jobId]);
+      nUnderWay += n;
+      while (nUnderWay > inFlight - Math.min(n, inFlight >> 2)) {
+        const [oldest, oldestJob] = underWay.shift()!;
+        nUnderWay -= oldest.request.shapes.length;
+        yield* this.#finish(oldest, oldestJob, options.onProgress);
+      }
+    }
+    for (const [batch, jobId] of underWay) yield* this.#finish(batch, jobId, options.onProgress);
+  }
+
+  async *#send(
+    shapes: Iterable<Item> | AsyncIterable<Item>,
+    options: { replace?: boolean; key?: string; inFlight: number },
+  ): AsyncGenerator<[Batch, bigint | undefined]> {
+    const limits = await this.library.limits();
+    const clientId = `add-many-${options.key ?? randomUUID()}`;
+    let index = 0;
+    const { inFlight, replace = false } = options;
+    for await (const batch of batches(this.name, shapes, limits, inFlight, replace, this.spec)) {
+      let jobId: bigint | undefined;
+      if (batch.request.shapes.length > 0) {
+        const { frames } = batch.writer;
+        const requestId = batch.requestId(index);
+        [{ jobId }] = await this.library.call("addShapes", batch.request, { frames, clientId, requestId });
+        // The bytes are the daemon's now.
+        frames.length = 0;
+      }
+      index += 1;
+      yield [batch, jobId];
+    }
+  }
+
+  async *#finish(batch: Batch, jobId: bigint | undefined, onProgress?: (job: Job) => void): AsyncGenerator<Added> {
+    const results = [...batch.results];
+    const ready: Added[] = [];
+    let nTaken = 0;
+    if (jobId !== undefined) {
+      for await (const message of this.library.watchWire(jobId)) {
+        onProgress?.(job(message));
+        for (let over; (over = added(message.items[nTaken])) !== undefined; nTaken += 1) ready.push(over);
+        while (results.length > 0 && (results[0] !== undefined || ready.length > 0)) {
+          const unsent = results.shift();
+          yield unsent ? failed(unsent.name, unsent.error) : ready.shift()!;
+        }
+      }
+    }
+    for (const unsent of results) {
+      if (unsent === undefined) throw new BadReply(`job ${jobId} is finished without all of its shapes`);
+      yield failed(unsent.name, unsent.error);
+    }
+  }
+
+  /** Waits until no shape is to be placed and no label to be recomputed, at most `timeout` seconds. */
+  async waitIdle(timeout = Infinity): Promise<Idle> {
+    for (let leftMs = timeout * 1000; ; ) {
+      const waitMs = Math.trunc(Math.min(WAIT_MS, Math.max(0, leftMs)));
+      const request = { collection: this.name, waitMs: BigInt(waitMs) };
+      const [reply] = await this.library.call("waitIdle", request);
+      leftMs -= waitMs;
+      if (reply.idle || leftMs <= 0) return plain(reply);
+      await sleep(PACE_MS);
+    }
+  }
+
+  /** All shapes in the order of their arrival, or those that carry a label. */
+  async *shapes(options: { label?: number } = {}): AsyncGenerator<Shape> {
+    let pageToken = "";
+    do {
+      const [reply] = await this.library.call("listShapes", { collection: this.name, pageToken, ...options });
+      for (const shape of reply.shapes) yield plain(shape);
+      pageToken = reply.nextPageToken;
+    } while (pageToken !== "");
+  }
+
+  /** One shape: its parts, what cleaning found, where its labels come from. */
+  async shape(name: string): Promise<Shape> {
+    const [{ shape }] = await this.library.call("getShape", { collection: this.name, shape: name });
+    if (shape === undefined) throw new BadReply("the shape is missing");
+    return plain(shape);
+  }
+
+  /** One label for each face of the bytes that were sent, in their order; −1: unlabelled. */
+  async labels(name: string, options: { version?: number } = {}): Promise<Int32Array> {
+    return (await this.labelling(name, options)).labels;
+  }
+
+  /** Labels with their version and, if wanted, their probabilities. */
+  async labelling(name: string, options: { version?: number; confidence?: boolean } = {}): Promise<Labelling> {
+    const { version = 0, confidence = false } = options;
+    const request = { collection: this.name, shape: name, version: BigInt(version), confidence };
+    const [reply, raw] = await this.library.call("getLabels", request);
+    const labels = raw.array(Int32Array, reply.labels).data;
+    const probabilities = reply.confidence && { confidence: raw.array(Float32Array, reply.confidence).data };
+    return { version: Number(reply.version), labels, ...probabilities };
+  }
+
+  /** The labels of all shapes as of one moment; `events({ since: snapshot.sequence })` goes on. */
+  async snapshot(): Promise<Snapshot> {
+    const [reply, raw] = await this.library.call("labelsSnapshot", { collection: this.name });
+    const shapes = reply.shapes.map((s): [string, Labelling] => {
+      return [s.shape, { version: Number(s.version), labels: raw.array(Int32Array, s.labels).data }];
+    });
+    return { sequence: Number(reply.sequence), shapes: new Map(shapes) };
+  }
+
+  /** The bytes of a shape as they were sent; of arrays, an OFF file with the same values. */
+  async original(name: string): Promise<Encoded> {
+    const [reply, raw] = await this.library.call("getOriginal", { collection: this.name, shape: name });
+    return { format: formatName(reply.format), data: raw.file(reply.bytes) };
+  }
+
+  /** Removes a shape. */
+  async remove(name: string): Promise<void> {
+    await this.library.call("removeShape", { collection: this.name, shape: name });
+  }
+
+  /** At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes. */
+  async portraits(
+    names: readonly string[],
+    detail: "proxy" | "surface" | "functions" = "proxy",
+  ): Promise<Uint8Array> {
+    const wanted = PortraitDetail[detail.toUpperCase() as keyof typeof PortraitDetail];
+    const request = { collection: this.name, shapes: [...names], detail: wanted };
+    const [reply, raw] = await this.library.call("getPortraits", request);
+    return raw.file(reply.pack);
+  }
+
+  /** Eigenvalues and, if wanted, eigenvectors and mass. */
+  async spectrum(name: string, options: { eigenvectors?: boolean } = {}): Promise<Spectrum> {
+    const { eigenvectors = false } = options;
+    const request = { collection: this.name, shape: name, eigenvectors };
+    const [reply, raw] = await this.library.call("getSpectrum", request);
+    return {
+      eigenvalues: raw.array(Float64Array, reply.eigenvalues).data,
+      ...(reply.eigenvectors && { eigenvectors: raw.array(Float32Array, reply.eigenvectors) }),
+      ...(reply.mass && { mass: raw.array(Float32Array, reply.mass).data }),
+      area: reply.area,
+    };
+  }
+
+  /** (n, t) heat kernel signature: a row for each vertex of the working mesh. */
+  async hks(name: string): Promise<Matrix<Float32Array>> {
+    const [reply, raw] = await this.library.call("getHks", { collection: this.name, shape: name });
+    return raw.array(Float32Array, reply.hks);
+  }
+
+  /** The working mesh and what the segmentation is computed from. */
+  async descriptors(name: string): Promise<Descriptors> {
+    const [reply, raw] = await this.library.call("getDescriptors", { collection: this.name, shape: name });
+    return {
+      vertices: raw.array(Float32Array, reply.vertices),
+      faces: raw.array(Uint32Array, reply.faces),
+      faceDescriptors: raw.array(Float32Array, reply.faceDescriptors),
+      patches: raw.array(Uint32Array, reply.patches).data,
+      faceMap: raw.array(Uint32Array, reply.faceMap).data,
+      polygonArea: raw.array(Float32Array, reply.polygonArea).data,
+      signature: raw.array(Float32Array, reply.signature).data,
+    };
+  }
+
+  /**
+   * The functional map that carries functions on `from` to functions on `to`, and the pointwise map back: the one
+   * by which labels are carried, which is kept, or, with options of {@link Points}, one made for points, in about 0.1 s.
+   */
+  async map(from: string, to: string, options?: MapOptions): Promise<FunctionalMap> {
+    const wish = options && ("agreement" in options ? options : { points: pointOptions(options) });
+    const [reply, raw] = await this.library.call("getFunctionalMap", { collection: this.name, from, to, ...wish });
+    return functionalMap(from, to, reply, raw);
+  }
+
+  /**
+   * Carries values at the faces of `from` to those of `to`, by a map between points: of an Int32Array one for each
+   * face, which are voted on; of a Float32Array as many for each face as there are, of which means are made.
+   */
+  async transfer<T extends Int32Array | Float32Array>(values: T, from: string, to: string, points: Points = {}): Promise<T> {
+    return (await this.transferred(values, from, to, points)).values;
+  }
+
+  /** What {@link transfer} gives, with the quality of the map. */
+  async transferred<T extends Int32Array | Float32Array>(
+    values: T,
+    from: string,
+    to: string,
+    points: Points = {},
+  ): Promise<Transferred<T>> {
+    const writer = new FrameWriter();
+    let shape = [values.length];
+    if (values instanceof Float32Array) {
+      const n = (await this.shape(from)).nPolygons;
+      shape = [n, values.length / n];
+    }
+    const array = writer.array(values, ...shape);
+    const request = { collection: this.name, from, to, values: array, points: pointOptions(points) };
+    const [reply, raw] = await this.library.call("transferFunction", request, { frames: writer.frames });
+    const type = values.constructor as new (buffer: ArrayBuffer) => T;
+    return { values: raw.array(type, reply.values).data, quality: mapQuality(reply.quality) };
+  }
+
+  /** Which part of `a` matches which part of `b`. */
+  async matchParts(a: string, b: string): Promise<PartMatches> {
+    const request = { collection: this.name, shapeA: a, shapeB: b };
+    return plain((await this.library.call("getPartCorrespondence", request))[0]);
+  }
+
+  /** The shapes most like one shape, nearest first. */
+  async nearest(name: string, limit = 5): Promise<Neighbor[]> {
+    const [reply] = await this.library.call("nearest", { collection: this.name, shape: name, limit });
+    return reply.neighbors.map(plain);
+  }
+
+  /**
+   * Labels faces of a shape by hand: an integer for each (−1 leaves one alone), one label for some faces, or
+   * one for a part. They never change again by themselves; other shapes follow: {@link waitIdle}.
+   */
+  async correct(
+    name: string,
+    correction:
+      | Int32Array
+      | { readonly faces: Uint32Array; readonly label: number }
+      | { readonly part: number; readonly label: number },
+  ): Promise<Corrected> {
+    const writer = new FrameWriter();
+    const what =
+      correction instanceof Int32Array
+        ? { case: "labels" as const, value: writer.array(correction, correction.length) }
+        : "faces" in correction
+          ? {
+              case: "faces" as const,
+              value: { faces: writer.array(correction.faces, correction.faces.length), label: correction.label },
+            }
+          : { case: "part" as const, value: correction };
+    const request = { collection: this.name, shape: name, correction: what };
+    const [reply] = await this.library.call("correctLabels", request, { frames: writer.frames });
+    return { ...plain(reply), jobId: reply.jobId };
+  }
+
+  /** Gives a label a name. */
+  async nameLabel(label: number, name: string): Promise<Label> {
+    const [reply] = await this.library.call("nameLabel", { collection: this.name, label, name });
+    return present(reply.label);
+  }
+
+  /** Makes one label of two: faces of `label` carry `into` from now on. */
+  async merge(label: number, into: number): Promise<ChangedLabel> {
+    const [reply] = await this.library.call("mergeLabels", { collection: this.name, label, into });
+    return { ...present(reply.label), nChanged: Number(reply.nShapes) };
+  }
+
+  /** Makes two labels of one, and returns the new one. */
+  async split(label: number): Promise<ChangedLabel> {
+    const [reply] = await this.library.call("splitLabel", { collection: this.name, label });
+    return { ...present(reply.label), nChanged: Number(reply.nShapes) };
+  }
+
+  /** Takes back the newest correction, name, merge or split. */
+  async undo(): Promise<Undone> {
+    return plain((await this.library.call("undo", { collection: this.name }))[0]);
+  }
+
+  /** The shape whose labelling by a person would help most, or undefined if there is none. */
+  async suggest(): Promise<Suggestion | undefined> {
+    try {
+      return plain((await this.library.call("suggestNext", { collection: this.name }))[0]);
+    } catch (e) {
+      if (e instanceof Refused && e.reason === "NOTHING_TO_SUGGEST") return undefined;
+      throw e;
+    }
+  }
+
+  /** Events of the log after `sequence`, in order. */
+  async eventsSince(sequence: number): Promise<Event[]> {
+    const found: Event[] = [];
+    for (;;) {
+      const request = { collection: this.name, sequence: BigInt(sequence) };
+      const [reply] = await this.library.call("eventsSince", request);
+      found.push(...reply.events.map(plain));
+      if (!reply.more) return found;
+      sequence = found.at(-1)!.sequence;
+    }
+  }
+
+  /**
+   * Events in order, each once and none left out: those after `since` (by default those from now on), then as
+   * they happen, without end. What the event socket drops is read from the log. A daemon that is restarted is
+   * waited for, at most `patience` seconds (without end).
+   */
+  async *events(options: { since?: number; patience?: number } = {}): AsyncGenerator<Event> {
+    let seen = options.since ?? (await this.info()).sequence;
+    for (;;) {
+      const endpoint = await this.#eventEndpoint(options.patience ?? Infinity);
+      const topics = [`${this.name}\0`, HEARTBEAT_TOPIC];
+      const subscription = this.library.transport.subscribe(endpoint, topics, SILENCE_MS);
+      try {
+        for await (const event of this.#follow(subscription, seen)) {
+          seen = event.sequence;
+          yield event;
+        }
+      } finally {
+        subscription.close();
+      }
+    }
+  }
+
+  /** Events after `seen` until the subscription falls silent. */
+  async *#follow(subscription: Subscription, seen: number): AsyncGenerator<Event> {
+    let newest: number | undefined;
+    for (;;) {
+      if (newest === undefined || newest > seen) {
+        // The log has what came before the subscription, and what it dropped.
+        let missed: Event[];
+        try {
+          missed = await this.eventsSince(seen);
+        } catch (e) {
+          if (e instanceof NoAnswer) return;
+          throw e;
+        }
+        for (const event of missed) {
+          seen = event.sequence;
+          yield event;
+        }
+      }
+      const body = await subscription.receive();
+      if (body === undefined) return;
+      const event = plain(fromBinary(EventSchema, body));
+      if (event.kind.case === "heartbeat") {
+        newest = event.kind.value.collections.find((c) => c.collection === this.name)?.sequence ?? seen;
+        if (newest < seen) {
+          throw new EventLogRewound(`the log of ${this.name} ends with event ${newest}, but event ${seen} was seen`);
+        }
+      } else if (event.sequence === seen + 1) {
+        seen = newest = event.sequence;
+        yield event;
+      } else {
+        newest = Math.max(newest ?? 0, event.sequence);
+      }
+    }
+  }
+
+  /** Where a daemon that may be away publishes. */
+  async #eventEndpoint(patience: number): Promise<string> {
+    for (let waited = 0; ; ) {
+      try {
+        return reachable((await this.library.hello()).eventEndpoint, this.library.endpoint);
+      } catch (e) {
+        waited += this.library.transport.timeout;
+        if (!(e instanceof NoAnswer) || waited >= patience) throw e;
+      }
+    }
+  }
+}
+
+/** A daemon that listens on all addresses names none: then the host is the one that is known. */
+export function reachable(announced: string, endpoint: string): string {
+  const every = /^tcp:\/\/(?:0\.0\.0\.0|\[::\]|\*):(\d+)$/.exec(announced);
+  const known = /^tcp:\/\/(.+):\d+$/.exec(endpoint);
+  return every && known ? `tcp://${known[1]}:${every[1]}` : announced;
+}

@@ -1,0 +1,98 @@
+/** What the daemon tells becomes what the client returns, and settings what it is asked with. */
+
+import { create } from "@bufbuild/protobuf";
+import { BadReply, refused } from "./errors.js";
+import { MapOrientation, type GetFunctionalMapReply, type MapQuality as WireMapQuality } from "./gen/coseg/v1/analysis_pb.js";
+import { CollectionSpecSchema, Operator, Up, type CollectionSpec, type LabelInfo } from "./gen/coseg/v1/collection_pb.js";
+import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/coseg/v1/job_pb.js";
+import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Settings } from "./types.js";
+import { plain, type Raw } from "./wire.js";
+
+export function spec(settings: Settings): CollectionSpec {
+  const up = settings.up?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
+  const operator = settings.operator?.toUpperCase().replace("-", "_") as keyof typeof Operator | undefined;
+  return create(CollectionSpecSchema, {
+    ...(settings.parts !== undefined && { nParts: settings.parts }),
+    workingFaces: settings.workingFaces ?? 0,
+    up: up === undefined ? Up.UNSPECIFIED : Up[up],
+    operator: operator === undefined ? Operator.UNSPECIFIED : Operator[operator],
+  });
+}
+
+export function present(label: LabelInfo | undefined): Label {
+  if (label === undefined) throw new BadReply("the label is missing");
+  return plain(label);
+}
+
+export function pointOptions({ landmarks = [], orientation, k = 0, alternative = false }: Points) {
+  const wanted = { keep: MapOrientation.KEEP, reverse: MapOrientation.REVERSE };
+  return {
+    landmarks: landmarks.map(([from, to]) => ({ from, to })),
+    orientation: orientation === undefined ? MapOrientation.UNSPECIFIED : wanted[orientation],
+    k,
+    alternative,
+  };
+}
+
+export function mapQuality(quality: WireMapQuality | undefined): MapQuality {
+  if (quality === undefined) throw new BadReply("the quality of a map is missing");
+  return plain(quality);
+}
+
+export function functionalMap(from: string, to: string, reply: GetFunctionalMapReply, raw: Raw): FunctionalMap {
+  const one = (c12: typeof reply.c12, p2p21: typeof reply.p2p21, quality: typeof reply.quality, matched: typeof reply.matched) => ({
+    from,
+    to,
+    c12: raw.array(Float32Array, c12),
+    p2p21: raw.array(Uint32Array, p2p21).data,
+    quality: mapQuality(quality),
+    matched: raw.array(Uint32Array, matched).data,
+  });
+  return {
+    ...one(reply.c12, reply.p2p21, reply.quality, reply.matched),
+    ...(reply.confidence && { confidence: raw.array(Float32Array, reply.confidence).data }),
+    ...(reply.agreement && { agreement: plain(reply.agreement) }),
+    ...(reply.alternativeC12 && {
+      alternative: one(reply.alternativeC12, reply.alternativeP2p21, reply.alternativeQuality, reply.alternativeMatched),
+    }),
+    ...(reply.alternativeCost !== undefined && { alternativeCost: reply.alternativeCost }),
+  };
+}
+
+export function job(message: WireJob | undefined): Job {
+  if (message === undefined) throw new BadReply("the job is missing");
+  return { ...plain(message), jobId: message.jobId };
+}
+
+const NOTHING_DONE = { nMaps: 0, nRelabelled: 0, nInconsistent: 0, stages: {} };
+
+export function failed(name: string, error: Error | undefined, outcome: "failed" | "cancelled" = "failed"): Added {
+  return { name, outcome, ok: false, ...(error && { error }), version: 0, sequence: 0, ...NOTHING_DONE };
+}
+
+/** What became of a shape of a job, once it is over. */
+export function added(item: JobItem | undefined): Added | undefined {
+  switch (item?.state) {
+    case ItemState.DONE: {
+      const { placed } = item;
+      if (placed === undefined) throw new BadReply(`${item.name} is done, but nothing was`);
+      return {
+        name: item.name,
+        outcome: Outcome[placed.outcome].toLowerCase() as Added["outcome"],
+        ok: true,
+        version: Number(placed.version),
+        sequence: Number(placed.sequence),
+        nMaps: placed.nMaps,
+        nRelabelled: placed.nRelabelled,
+        nInconsistent: placed.nInconsistent,
+        stages: Object.fromEntries(placed.stages.map((s) => [s.stage, s.ms])),
+      };
+    }
+    case ItemState.FAILED:
+      return failed(item.name, item.error && refused(item.error));
+    case ItemState.CANCELLED:
+      return failed(item.name, item.error && refused(item.error), "cancelled");
+    default:
+      return undefined;
+  }
+}

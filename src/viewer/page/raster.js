@@ -1,0 +1,222 @@
+// Triangles become a small picture on the processor: an emulated graphics card takes longer to hand one over than it takes
+// to draw it here, and a real one has nothing to do that is worth its start.
+
+/** Samples of a pixel, in each direction. */
+const SAMPLES = 2;
+/** Corners whose face is less than this off the mean around their vertex are lit by that mean. */
+const SMOOTH = Math.cos((36 * Math.PI) / 180);
+/** Half the width of lines between labels, in pixels, and over how much they fade. */
+const LINE = [0.35, 1.35];
+/** How dark such lines are. */
+const LINE_SHADE = 0.32;
+/** Light from none to full in so many steps, as a screen wants it. */
+const STEPS = 1023;
+const GAMMA = 2.2;
+const ON_SCREEN = Uint8Array.from({ length: STEPS + 1 }, (_, i) => Math.round(255 * (i / STEPS) ** (1 / GAMMA)));
+/** The directions of `FRAGMENT` in draw.js: of both lights, and of the first with the eye. */
+const KEY = direction(0.45, 0.75, 0.65);
+const FILL = direction(-0.8, 0.1, 0.5);
+
+function direction(x, y, z) {
+  const length = Math.hypot(x, y, z);
+  return [x / length, y / length, z / length];
+}
+
+/** Draws one mesh after the other. */
+class Raster {
+  constructor() {
+    this.depth = new Float32Array(0);
+    this.colours = new Uint32Array(0);
+    this.light = new Float32Array(0);
+  }
+
+  /** A mesh as it is seen first, with its faces in colours of their labels. */
+  picture(mesh, colour, width, height) {
+    const view = new View();
+    const [columns, rows] = [width * SAMPLES, height * SAMPLES];
+    view.box = [0, 0, columns, rows];
+    view.fit(mesh);
+    const n = columns * rows;
+    if (this.depth.length !== n) [this.depth, this.colours] = [new Float32Array(n), new Uint32Array(n)];
+    this.depth.fill(-Infinity);
+    this.colours.fill(0);
+    this.fill(mesh, view, colour, columns, rows);
+    return this.averaged(width, height);
+  }
+
+  /** Draws all triangles. */
+  fill(mesh, view, colour, columns, rows) {
+    const { depth, colours } = this;
+    const { faces, nFaces, labels } = mesh;
+    const seen = view.project(mesh.positions);
+    if (this.light.length < 12 * nFaces) this.light = new Float32Array(12 * nFaces);
+    const { light } = this;
+    shine(mesh, view, light);
+    const between = sidesBetween(mesh);
+    const paints = new Map();
+    const [solid, faded] = LINE.map((x) => x * SAMPLES);
+    const tint = new Float32Array(9);
+    for (let f = 0; f < nFaces; f++) {
+      const a = 3 * faces[3 * f], b = 3 * faces[3 * f + 1], c = 3 * faces[3 * f + 2];
+      const ax = seen[a], ay = seen[a + 1], az = seen[a + 2];
+      const bx = seen[b] - ax, by = seen[b + 1] - ay, bz = seen[b + 2] - az;
+      const cx = seen[c] - ax, cy = seen[c + 1] - ay, cz = seen[c + 2] - az;
+      const area = bx * cy - by * cx;
+      if (area === 0) continue;
+      const left = Math.max(Math.ceil(ax + Math.min(0, bx, cx) - 0.5), 0);
+      const right = Math.min(Math.floor(ax + Math.max(0, bx, cx) - 0.5), columns - 1);
+      const top = Math.max(Math.ceil(ay + Math.min(0, by, cy) - 0.5), 0);
+      const bottom = Math.min(Math.floor(ay + Math.max(0, by, cy) - 0.5), rows - 1);
+      if (left > right || top > bottom) continue;
+      let paint = paints.get(labels[f]);
+      if (!paint) paints.set(labels[f], (paint = colour(labels[f]).map((x) => (x / 255) ** GAMMA)));
+      // Red, green and blue of the first corner, and how much more the others have.
+      for (let i = 0, l = 12 * f; i < 3; i++) {
+        const first = paint[i] * light[l + i] + light[l + 3];
+        tint[i] = first;
+        tint[3 + i] = paint[i] * light[l + 4 + i] + light[l + 7] - first;
+        tint[6 + i] = paint[i] * light[l + 8 + i] + light[l + 11] - first;
+      }
+      const [r, g, k, rb, gb, kb, rc, gc, kc] = tint;
+      // Samples between a corner and the side opposite, where that side is between two labels.
+      const lines = between[f];
+      const toA = lines & 1 ? Math.abs(area) / Math.hypot(cx - bx, cy - by) : Infinity;
+      const toB = lines & 2 ? Math.abs(area) / Math.hypot(cx, cy) : Infinity;
+      const toC = lines & 4 ? Math.abs(area) / Math.hypot(bx, by) : Infinity;
+      // Shares of the second and the third corner, and how they grow from sample to sample.
+      const right1 = cy / area, down1 = -cx / area, right2 = -by / area, down2 = bx / area;
+      for (let y = top; y <= bottom; y++) {
+        const px = left + 0.5 - ax, py = y + 0.5 - ay;
+        let u = px * right1 + py * down1;
+        let v = px * right2 + py * down2;
+        for (let at = y * columns + left, end = y * columns + right; at <= end; at++, u += right1, v += right2) {
+          if (u < 0 || v < 0 || u + v > 1) continue;
+          const near = az + u * bz + v * cz;
+          if (near <= depth[at]) continue;
+          depth[at] = near;
+          let shade = STEPS;
+          if (lines) {
+            const edge = (Math.min((1 - u - v) * toA, u * toB, v * toC) - solid) / (faded - solid);
+            const smooth = edge <= 0 ? 0 : edge >= 1 ? 1 : edge * edge * (3 - 2 * edge);
+            shade *= LINE_SHADE + (1 - LINE_SHADE) * smooth;
+          }
+          const red = ON_SCREEN[Math.min(shade * (r + u * rb + v * rc), STEPS) | 0];
+          const green = ON_SCREEN[Math.min(shade * (g + u * gb + v * gc), STEPS) | 0];
+          const blue = ON_SCREEN[Math.min(shade * (k + u * kb + v * kc), STEPS) | 0];
+          colours[at] = 0xff000000 | (blue << 16) | (green << 8) | red;
+        }
+      }
+    }
+  }
+
+  /** Pixels as means of their samples; what covers some of them is transparent in part. */
+  averaged(width, height) {
+    const { colours } = this;
+    const columns = width * SAMPLES;
+    const picture = new ImageData(width, height);
+    const { data } = picture;
+    for (let y = 0, p = 0; y < height; y++)
+      for (let x = 0; x < width; x++, p += 4) {
+        let [n, r, g, b] = [0, 0, 0, 0];
+        for (let j = 0; j < SAMPLES; j++)
+          for (let i = 0; i < SAMPLES; i++) {
+            const sample = colours[(y * SAMPLES + j) * columns + x * SAMPLES + i];
+            if (sample === 0) continue;
+            n++;
+            r += sample & 255;
+            g += (sample >> 8) & 255;
+            b += (sample >> 16) & 255;
+          }
+        if (n === 0) continue;
+        data[p] = r / n;
+        data[p + 1] = g / n;
+        data[p + 2] = b / n;
+        data[p + 3] = (255 * n) / (SAMPLES * SAMPLES);
+      }
+    return picture;
+  }
+}
+
+/** For each face which of the sides opposite its corners (1, 2, 4) are between two labels. */
+function sidesBetween({ positions, faces, nFaces, labels }) {
+  const n = positions.length / 3;
+  // Such a side is between two vertices that faces of several labels meet at; those are few.
+  const of = new Int32Array(n).fill(-2);
+  const mixed = new Uint8Array(n);
+  for (let c = 0; c < 3 * nFaces; c++) {
+    const [v, label] = [faces[c], labels[(c / 3) | 0]];
+    if (of[v] === -2) of[v] = label;
+    else if (of[v] !== label) mixed[v] = 1;
+  }
+  const sides = new Uint8Array(nFaces);
+  const open = new Map();
+  for (let f = 0; f < nFaces; f++)
+    for (let i = 0; i < 3; i++) {
+      const a = faces[3 * f + ((i + 1) % 3)];
+      const b = faces[3 * f + ((i + 2) % 3)];
+      if (!mixed[a] || !mixed[b]) continue;
+      const key = a < b ? a * n + b : b * n + a;
+      const other = open.get(key);
+      if (other === undefined) open.set(key, 4 * f + i);
+      else if (labels[other >> 2] !== labels[f]) {
+        sides[f] |= 1 << i;
+        sides[other >> 2] |= 1 << (other & 3);
+      }
+    }
+  return sides;
+}
+
+/** For each corner what light does to red, green and blue there, and what it adds to all: as `FRAGMENT` in draw.js. */
+function shine(mesh, view, out) {
+  const { positions: p, faces, nFaces } = mesh;
+  const own = mesh.faceNormals;
+  const mean = new Float32Array(p.length);
+  for (let c = 0; c < 3 * nFaces; c++) {
+    const f = c - (c % 3);
+    const v = 3 * faces[c];
+    for (let i = 0; i < 3; i++) mean[v + i] += own[f + i];
+  }
+  const t = view.turn;
+  const half = direction(KEY[0], KEY[1], KEY[2] + 1);
+  const lit = (to, x, y, z, v) => {
+    // Turned as the shape is, and towards the eye.
+    const size = Math.sqrt(x * x + y * y + z * z) || 1;
+    let nx = (t[0] * x + t[1] * y + t[2] * z) / size;
+    let ny = (t[3] * x + t[4] * y + t[5] * z) / size;
+    let nz = (t[6] * x + t[7] * y + t[8] * z) / size;
+    const ex = -(t[0] * p[v] + t[1] * p[v + 1] + t[2] * p[v + 2]);
+    const ey = -(t[3] * p[v] + t[4] * p[v + 1] + t[5] * p[v + 2]);
+    const ez = 5 - (t[6] * p[v] + t[7] * p[v + 1] + t[8] * p[v + 2]);
+    let facing = (nx * ex + ny * ey + nz * ez) / Math.sqrt(ex * ex + ey * ey + ez * ez);
+    if (facing < 0) {
+      nx = -nx;
+      ny = -ny;
+      nz = -nz;
+      facing = -facing;
+    }
+    const key = 0.62 * Math.max(nx * KEY[0] + ny * KEY[1] + nz * KEY[2], 0);
+    const fill = 0.16 * Math.max(nx * FILL[0] + ny * FILL[1] + nz * FILL[2], 0);
+    const sky = 0.16 * (0.5 + 0.5 * ny);
+    const rim = 0.1 * (1 - facing) ** 3;
+    const all = 0.3 + fill + rim;
+    out[to] = all + 0.9 * sky + 1.03 * key;
+    out[to + 1] = all + 0.97 * sky + key;
+    out[to + 2] = all + 1.1 * sky + 0.95 * key;
+    out[to + 3] = 0.06 * Math.max(nx * half[0] + ny * half[1] + nz * half[2], 0) ** 28;
+  };
+  // A vertex around which all is smooth is lit once.
+  const known = new Int32Array(p.length / 3).fill(-1);
+  for (let c = 0; c < 3 * nFaces; c++) {
+    const f = c - (c % 3);
+    const v = 3 * faces[c];
+    const x = own[f], y = own[f + 1], z = own[f + 2];
+    const mx = mean[v], my = mean[v + 1], mz = mean[v + 2];
+    const along = x * mx + y * my + z * mz;
+    const smooth = along > SMOOTH * Math.sqrt((x * x + y * y + z * z) * (mx * mx + my * my + mz * mz));
+    if (!smooth) lit(4 * c, x, y, z, v);
+    else if (known[faces[c]] < 0) {
+      lit(4 * c, mx, my, mz, v);
+      known[faces[c]] = 4 * c;
+    } else for (let i = 0, from = known[faces[c]]; i < 4; i++) out[4 * c + i] = out[from + i];
+  }
+}
