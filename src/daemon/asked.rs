@@ -16,7 +16,6 @@ use crate::library::{LibraryError, RequestKey};
 use bytes::Bytes;
 use prost::Message as _;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 /// Answers a request that changes nothing. If the future is dropped, because whoever asked waits no longer, the work
@@ -106,7 +105,7 @@ fn answer(
             text,
             out_of_memory,
         }) => {
-            daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+            daemon.metrics.workers_died.inc();
             tracing::warn!(
                 collection,
                 text,

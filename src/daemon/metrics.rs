@@ -78,6 +78,7 @@ pub(crate) struct Metrics {
     finished: Labelled<OutcomeLabel, Counter>,
     pub(crate) relabelled: Counter,
     pub(crate) inconsistent: Counter,
+    pub(crate) workers_died: Counter,
     pub(crate) events: Counter,
     pub(crate) replies: Counter,
     pub(crate) received_bytes: Counter,
@@ -121,6 +122,7 @@ impl Metrics {
             finished: Family::default(),
             relabelled: Counter::default(),
             inconsistent: Counter::default(),
+            workers_died: Counter::default(),
             events: Counter::default(),
             replies: Counter::default(),
             received_bytes: Counter::default(),
@@ -219,6 +221,11 @@ impl Metrics {
             "maps_inconsistent",
             "Maps to new shapes that did not agree with the maps between the shapes they come from",
             self.inconsistent.clone(),
+        );
+        r.register(
+            "workers_died",
+            "Workers that ended over a shape or a request: aborted, out of memory",
+            self.workers_died.clone(),
         );
         r.register("events", "Events published", self.events.clone());
         r.register(

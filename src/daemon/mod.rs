@@ -107,7 +107,6 @@ struct Counters {
     requests: AtomicU64,
     refused: AtomicU64,
     failed: AtomicU64,
-    workers_died: AtomicU64,
 }
 
 /// What all tasks of the daemon share.

@@ -291,7 +291,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32
         }
         Ok(Ok(Err(death))) => {
             *n_deaths += 1;
-            daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+            daemon.metrics.workers_died.inc();
             fault(&death);
             return *n_deaths < MAX_ATTEMPTS;
         }

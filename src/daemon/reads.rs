@@ -8,7 +8,7 @@ use crate::daemon::{Daemon, requests};
 use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
-use crate::library::{JobFilter, Library, LibraryError, MapInfo};
+use crate::library::{JobFilter, Library, LibraryError};
 use crate::mesh::Format;
 use bytes::Bytes;
 use std::sync::Arc;
@@ -141,27 +141,13 @@ fn kept_map(
             .kept_point_maps(collection, from, to, &convert::point_request(points))
             .map_err(refuse)?
             .map(|maps| convert::point_maps(&maps, frames)),
+        // To compare it with the others is to compute.
+        None if r.agreement => None,
         None => library
             .kept_map(collection, from, to)
             .map_err(refuse)?
-            .map(|map| map_reply(library, r, &map, frames))
-            .transpose()?,
+            .map(|map| convert::functional_map(&map, frames)),
     })
-}
-
-/// What is told of a map for parts.
-pub(crate) fn map_reply(
-    library: &Library,
-    r: &wire::GetFunctionalMapRequest,
-    map: &MapInfo,
-    frames: &mut FrameWriter,
-) -> Result<wire::GetFunctionalMapReply, wire::Error> {
-    let mut reply = convert::functional_map(map, frames);
-    if r.agreement {
-        let standing = library.standing(&r.collection, &r.from, &r.to, map);
-        reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
-    }
-    Ok(reply)
 }
 
 fn refuse(e: LibraryError) -> wire::Error {

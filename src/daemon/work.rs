@@ -14,7 +14,6 @@ use crate::library::isolate::DescribeJob;
 use crate::library::{Described, Failure, Job, JobItem, LibraryError};
 use crate::pipeline::Description;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
@@ -301,7 +300,7 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
 /// Counts, durably, that the work on a shape has ended its worker; how often now, or 0 if the shape is over.
 pub(super) fn note_death(daemon: &Daemon, item: &JobItem, text: &str) -> Result<u32, LibraryError> {
     let attempts = daemon.library.note_attempt(item, text)?;
-    daemon.counters.workers_died.fetch_add(1, Ordering::Relaxed);
+    daemon.metrics.workers_died.inc();
     tracing::warn!(
         collection = item.collection,
         shape = item.name,

@@ -175,7 +175,11 @@ pub(crate) fn look_for_room(daemon: &Daemon, n_shapes: usize) -> Result<(), wire
     if daemon.is_draining() {
         return Ok(());
     }
-    admit(daemon, &vec![0; n_shapes])
+    match admit(daemon, &vec![0; n_shapes]) {
+        Err(full) if full.code() == ErrorCode::ResourceExhausted => Err(full),
+        // What can never be taken in is looked at closely, and told what is wrong with it.
+        _ => Ok(()),
+    }
 }
 
 /// Refuses shapes for which the queue has no room: by number, by bytes, and by the time that placing all of

@@ -1,7 +1,7 @@
 //! Requests whose answers are computed from shapes, or that change their labels, answered from the library.
 
 use crate::Library;
-use crate::daemon::reads::{map_reply, page};
+use crate::daemon::reads::page;
 use crate::daemon::requests::Answer;
 use crate::daemon::writes;
 use crate::ipc::convert;
@@ -55,7 +55,12 @@ pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes])
             }
             None => {
                 let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
-                Reply::GetFunctionalMap(map_reply(library, r, &map, &mut frames)?)
+                let mut reply = convert::functional_map(&map, &mut frames);
+                if r.agreement {
+                    let standing = library.standing(&r.collection, &r.from, &r.to, &map);
+                    reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
+                }
+                Reply::GetFunctionalMap(reply)
             }
         },
         Body::TransferFunction(r) => {

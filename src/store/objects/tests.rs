@@ -71,6 +71,7 @@ fn what_was_put_survives_a_crash_at_every_operation() {
             }
         }
     }
+    println!("{n_images} crash images");
     assert!(n_images >= 2_000, "{n_images}");
 }
 
@@ -148,6 +149,7 @@ fn every_operation_may_fail_once_or_for_ever() {
         objects.put_original(&bytes).expect("stored");
     }
     let n_operations = disk.n_operations();
+    println!("{} faults", 4 * n_operations);
     assert!(n_operations > 60, "{n_operations}");
     for at in 0..n_operations {
         for errno in [EIO, ENOSPC] {

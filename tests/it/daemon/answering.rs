@@ -50,7 +50,7 @@ fn map(from: &str, k: u32) -> Body {
             k,
             ..Default::default()
         }),
-        agreement: false,
+        ..Default::default()
     })
 }
 
