@@ -1,7 +1,7 @@
 //! Collections: created, described, deleted; their labels named.
 
 use super::commit::event;
-use super::history::Before;
+use super::history::{Before, from_reply};
 use super::rows::{CollectionState, damaged, operator_from_name, operator_name, to_json};
 use super::{
     CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
@@ -115,7 +115,7 @@ impl Library {
         check_name("label", name, MAX_LABEL_NAME)?;
         let row = self.collection_row(collection)?;
         let request = Digest::of(format!("name {collection:?} {label} {name:?}").as_bytes());
-        self.with_lane(row, |lane| {
+        let reply = self.with_lane(row, |lane| {
             self.once(key, request, |tx| {
                 let mut known = find_label(tx, lane.row.id, label)?;
                 let labels = tx.labels(lane.row.id)?;
@@ -140,21 +140,31 @@ impl Library {
                         name: name.into(),
                     },
                 )?;
-                Ok(Vec::new())
+                Ok(to_json(&label_in(tx, lane.row.id, label)?).into_bytes())
             })
         })?;
-        let row = self.collection_row(collection)?;
-        self.label_of(&row, label)
+        if reply.is_empty() {
+            // An earlier version kept no more of its answer than that there was one.
+            return self.label_of(&self.collection_row(collection)?, label);
+        }
+        from_reply(&reply)
     }
 
     /// A label as it stands.
     pub(super) fn label_of(&self, row: &CollectionRow, label: LabelId) -> Result<LabelInfo> {
-        self.store.catalog().read(|r| {
-            let uses = r.label_uses(row.id)?;
-            let n_shapes = uses.get(&label).copied().unwrap_or(0);
-            Ok(label_info(find_label(r, row.id, label)?, n_shapes))
-        })
+        self.store.catalog().read(|r| label_in(r, row.id, label))
     }
+}
+
+/// A label as a reader sees it.
+pub(super) fn label_in(
+    reader: &Reader<'_>,
+    collection: crate::store::CollectionId,
+    label: LabelId,
+) -> Result<LabelInfo> {
+    let uses = reader.label_uses(collection)?;
+    let n_shapes = uses.get(&label).copied().unwrap_or(0);
+    Ok(label_info(find_label(reader, collection, label)?, n_shapes))
 }
 
 /// A label of a collection, in use or not.

@@ -1,6 +1,6 @@
 //! A person says that two labels are one, or that one is two.
 
-use super::collections::find_label;
+use super::collections::{find_label, label_in};
 use super::commit::{collection_row, event, put_relabelled};
 use super::history::{Before, from_reply};
 use super::lane::Lane;
@@ -37,9 +37,9 @@ impl Library {
     ) -> Result<(LabelInfo, u64)> {
         let request = Digest::of(format!("merge {collection:?} {label} {into}").as_bytes());
         let row = self.collection_row(collection)?;
-        let n_shapes = self.with_lane(row, |lane| {
+        self.with_lane(row, |lane| {
             if let Some(reply) = self.answered(key, request)? {
-                return from_reply::<u64>(&reply);
+                return self.told(&reply, lane, into);
             }
             if label == into {
                 let message = format!("label {label} cannot be merged into itself");
@@ -102,13 +102,21 @@ impl Library {
                 if let Some(learnt) = &learnt {
                     tx.set_model(id, &learnt.encode())?;
                 }
-                Ok(to_json(&(relabelled.len() as u64)).into_bytes())
+                let label = label_in(tx, id, into)?;
+                Ok(to_json(&(label, relabelled.len() as u64)).into_bytes())
             })?;
             self.reload(lane)?;
-            from_reply::<u64>(&reply)
-        })?;
-        let row = self.collection_row(collection)?;
-        Ok((self.label_of(&row, into)?, n_shapes))
+            from_reply(&reply)
+        })
+    }
+
+    /// What was answered before; an earlier version kept less of it, and the label is told as it stands.
+    fn told(&self, reply: &[u8], lane: &Lane, label: LabelId) -> Result<(LabelInfo, u64)> {
+        from_reply(reply).or_else(|_| {
+            let told = from_reply::<(LabelId, u64)>(reply);
+            let (label, n) = told.or_else(|_| from_reply(reply).map(|n: u64| (label, n)))?;
+            Ok((self.label_of(&lane.row, label)?, n))
+        })
     }
 
     /// Makes two labels of one, by what tells its patches apart most over the collection (two means of their mean
@@ -125,9 +133,9 @@ impl Library {
     ) -> Result<(LabelInfo, u64)> {
         let request = Digest::of(format!("split {collection:?} {label}").as_bytes());
         let row = self.collection_row(collection)?;
-        let (new, n_shapes) = self.with_lane(row, |lane| {
+        self.with_lane(row, |lane| {
             if let Some(reply) = self.answered(key, request)? {
-                return from_reply::<(LabelId, u64)>(&reply);
+                return self.told(&reply, lane, label);
             }
             self.label_in_use(lane, label)?;
             let new = lane.row.next_label;
@@ -234,13 +242,12 @@ impl Library {
                 event(tx, id, &split)?;
                 put_changes(tx, lane, &mut relabelled, &pinned, &state)?;
                 tx.mark_all_stale(id)?;
-                Ok(to_json(&(new, relabelled.len() as u64)).into_bytes())
+                let label = label_in(tx, id, new)?;
+                Ok(to_json(&(label, relabelled.len() as u64)).into_bytes())
             })?;
             self.reload(lane)?;
-            from_reply::<(LabelId, u64)>(&reply)
-        })?;
-        let row = self.collection_row(collection)?;
-        Ok((self.label_of(&row, new)?, n_shapes))
+            from_reply(&reply)
+        })
     }
 
     /// A label that is there and was not merged into another.

@@ -118,7 +118,7 @@ pub struct UpEstimate {
 }
 
 /// A label of a collection.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LabelInfo {
     /// Its id.
     pub id: LabelId,
