@@ -5,7 +5,6 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
-use pulp::Arch;
 
 const BLOCK: usize = 256;
 
@@ -182,7 +181,6 @@ fn products(
         n_targets > 0,
         "the nearest of no rows: at least one target is needed"
     );
-    let arch = Arch::new();
     // Column q of the product holds query q against a block of targets: contiguous for the scan.
     let mut product = Mat::<f32>::zeros(BLOCK.min(n_targets), BLOCK.min(n_queries.max(1)));
     for q0 in (0..n_queries).step_by(BLOCK) {
@@ -200,21 +198,18 @@ fn products(
                 1.0f32,
                 Par::Seq,
             );
-            arch.dispatch(|| {
-                for j in 0..nq {
-                    let column = block.as_ref().col(j);
-                    let Some(column) = column.try_as_col_major() else {
-                        unreachable!("owned columns")
-                    };
-                    visit(q0 + j, t0, column.as_slice());
-                }
-            });
+            for j in 0..nq {
+                let column = block.as_ref().col(j);
+                let Some(column) = column.try_as_col_major() else {
+                    unreachable!("owned columns")
+                };
+                visit(q0 + j, t0, column.as_slice());
+            }
         }
     }
 }
 
 /// Index and value of the least `half_norm − product`; the lowest index on ties.
-#[inline(always)]
 fn least(product: &[f32], half_norms: &[f32]) -> (usize, f32) {
     // Eight independent lanes let the compiler keep the scan in vector registers.
     let mut value = [f32::INFINITY; 8];
