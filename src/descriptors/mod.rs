@@ -15,7 +15,7 @@ mod spectral;
 
 pub use geodesic::{GeodesicProfile, geodesic_profile};
 pub use local_pca::local_pca;
-pub use position::{position, up_columns};
+pub use position::{N_UP_COLUMNS, position, up_columns};
 pub use shape_diameter::shape_diameter;
 pub use signature::{N_SHAPE_DNA, signature};
 pub use spectral::{

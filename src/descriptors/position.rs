@@ -7,6 +7,10 @@ use nalgebra::Matrix3;
 
 /// Columns of `position`.
 pub(super) const N_COLUMNS: usize = 7;
+/// Columns of [`up_columns`].
+pub const N_UP_COLUMNS: usize = 5;
+/// Layers in which the area along the up axis is counted.
+const N_LAYERS: usize = 64;
 /// Rounds of smoothing of the columns along the up axis, as of all face descriptors.
 const ROUNDS: usize = 2;
 /// Extents below this are none.
@@ -43,16 +47,19 @@ pub fn position(geometry: &FaceGeometry) -> Vec<f64> {
 }
 
 /// For each face of a mesh whose `up` is known: height from 0 at the lowest to 1 at the highest face,
-/// distance from the vertical through the centroid over the largest one, and the cosine of normal and
-/// up; smoothed like the other face descriptors. `up` need not be of length 1; a flat or pole-like
-/// shape has 0 where there is no extent.
-pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; 3]> {
+/// distance from the vertical through the centroid over the largest one, the cosine of normal and up,
+/// its absolute value (a plate has the same above and below), and the share of the area that is lower
+/// (a seat is the middle of a chair, however long the legs); smoothed like the other face descriptors.
+/// `up` need not be of length 1; a flat or pole-like shape has 0 where there is no extent.
+pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; N_UP_COLUMNS]> {
     let geometry = FaceGeometry::new(mesh);
     let axis = unit(up);
     let center = centroid(&geometry);
-    let heights: Vec<f64> = geometry.centroids.iter().map(|&c| dot(c, axis)).collect();
-    let low = heights.iter().copied().fold(f64::INFINITY, f64::min);
-    let high = heights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let share = |x: f64, of: f64| if of > MIN_EXTENT { x / of } else { 0.0 };
+    let along: Vec<f64> = geometry.centroids.iter().map(|&c| dot(c, axis)).collect();
+    let low = along.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = along.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let heights: Vec<f64> = along.iter().map(|x| share(x - low, high - low)).collect();
     let radii: Vec<f64> = geometry
         .centroids
         .iter()
@@ -62,26 +69,48 @@ pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; 3]> {
         })
         .collect();
     let widest = radii.iter().copied().fold(0.0, f64::max);
-    let share = |x: f64, of: f64| if of > MIN_EXTENT { x / of } else { 0.0 };
+    let lower = lower_area(&heights, &geometry.areas);
     let mut values: Vec<f64> = (0..mesh.faces.len())
         .flat_map(|f| {
-            let height = share(heights[f] - low, high - low);
-            [
-                height,
-                share(radii[f], widest),
-                dot(geometry.normals[f], axis),
-            ]
+            let slope = dot(geometry.normals[f], axis);
+            let radius = share(radii[f], widest);
+            [heights[f], radius, slope, slope.abs(), lower[f]]
         })
         .collect();
     // Smoothing does not cross bridges, so the graph does without them.
-    smooth(&DualGraph::new(mesh, &[]), &mut values, 3, ROUNDS);
-    let (rows, _) = values.as_chunks::<3>();
+    smooth(
+        &DualGraph::new(mesh, &[]),
+        &mut values,
+        N_UP_COLUMNS,
+        ROUNDS,
+    );
+    let (rows, _) = values.as_chunks::<N_UP_COLUMNS>();
     rows.iter().map(|row| row.map(|x| x as f32)).collect()
+}
+
+/// Share of the area below each of `heights` (0 to 1), linear within each of so many layers: faces of one height
+/// have one value, however many there are.
+fn lower_area(heights: &[f64], areas: &[f64]) -> Vec<f64> {
+    let mut layers = [0.0; N_LAYERS];
+    let layer = |h: f64| ((h * N_LAYERS as f64) as usize).min(N_LAYERS - 1);
+    for (&h, &area) in heights.iter().zip(areas) {
+        layers[layer(h)] += area;
+    }
+    let total: f64 = areas.iter().sum();
+    let mut below = [0.0; N_LAYERS];
+    for i in 1..N_LAYERS {
+        below[i] = below[i - 1] + layers[i - 1];
+    }
+    let at = |h: f64| {
+        let i = layer(h);
+        (below[i] + layers[i] * (h * N_LAYERS as f64 - i as f64)) / total
+    };
+    heights.iter().map(|&h| at(h)).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{N_COLUMNS, position, up_columns};
+    use super::{N_COLUMNS, lower_area, position, up_columns};
     use crate::mesh::{FaceGeometry, TriMesh, clean, norm, zoo};
 
     fn dumbbell() -> TriMesh {
@@ -107,22 +136,38 @@ mod tests {
         let upside_down = up_columns(&mesh, [-1.0, 0.0, 0.0]);
         let half_length = g.centroids.iter().map(|c| c[0]).fold(0.0, f64::max);
         for (f, c) in g.centroids.iter().enumerate() {
-            let [h, r, n] = upright[f].map(f64::from);
+            let [h, r, n, steep, lower] = upright[f].map(f64::from);
             assert!(
                 (h - 0.5 * (c[0] / half_length + 1.0)).abs() < 0.05,
                 "{h} at {c:?}"
             );
             assert!((0.0..=1.0).contains(&r) && n.abs() <= 1.0 + 1e-6);
-            let [h2, r2, n2] = upside_down[f].map(f64::from);
+            let [h2, r2, n2, steep2, lower2] = upside_down[f].map(f64::from);
             assert!((h + h2 - 1.0).abs() < 1e-5 && (r - r2).abs() < 1e-5 && (n + n2).abs() < 1e-5);
+            assert!(
+                (steep - steep2).abs() < 1e-5 && steep >= n.abs() - 1e-5 && steep <= 1.0 + 1e-6
+            );
+            assert!((lower + lower2 - 1.0).abs() < 0.02, "{lower} and {lower2}");
         }
     }
 
     #[test]
     fn without_extent_there_is_no_height() {
         let sheet = clean(&zoo::parsed(&zoo::grid(4, 4))).unwrap().mesh;
-        for [h, _, n] in up_columns(&sheet, [0.0, 0.0, 1.0]) {
-            assert_eq!((h, n), (0.0, 1.0));
+        for [h, _, n, steep, _] in up_columns(&sheet, [0.0, 0.0, 1.0]) {
+            assert_eq!((h, n, steep), (0.0, 1.0, 1.0));
+        }
+    }
+
+    #[test]
+    fn lower_area_depends_on_the_height_alone() {
+        // A tenth at the bottom, a plate of six tenths halfway up, the rest at the top.
+        let heights = [0.0, 0.5, 0.5, 0.5, 1.0];
+        let areas = [0.1, 0.2, 0.2, 0.2, 0.3];
+        let lower = lower_area(&heights, &areas);
+        assert_eq!(lower[1], lower[3]);
+        for (found, right) in lower.iter().zip([0.0, 0.1, 0.1, 0.1, 1.0]) {
+            assert!((found - right).abs() < 1e-12, "{lower:?}");
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::descriptors;
 /// Standardised values are clipped to this many standard deviations.
 const CLIP: f64 = 4.0;
 
-/// Face descriptors of one shape, row-major `(m, dim)`; with a known up axis three columns more.
+/// Face descriptors of one shape, row-major `(m, dim)`; with a known up axis [`descriptors::N_UP_COLUMNS`] more.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Features {
     /// The values.
@@ -19,7 +19,7 @@ pub struct Features {
 pub(crate) fn groups(up_known: bool) -> Vec<(&'static str, usize)> {
     let mut groups = descriptors::GROUPS.to_vec();
     if up_known {
-        groups.push(("up", 3));
+        groups.push(("up", descriptors::N_UP_COLUMNS));
     }
     groups
 }
@@ -35,12 +35,13 @@ impl Features {
             };
         };
         let columns = descriptors::up_columns(&shape.mesh(), axis);
-        let mut data = Vec::with_capacity(shape.faces.len() * (n + 3));
+        let dim = n + descriptors::N_UP_COLUMNS;
+        let mut data = Vec::with_capacity(shape.faces.len() * dim);
         for (row, extra) in shape.face_descriptors.chunks_exact(n).zip(&columns) {
             data.extend_from_slice(row);
             data.extend_from_slice(extra);
         }
-        Self { data, dim: n + 3 }
+        Self { data, dim }
     }
 
     /// Values at vertices `(n, dim)`: area-weighted means over the faces around each.
@@ -107,25 +108,57 @@ impl Normalisation {
         }
     }
 
-    /// `clip((x − mean) / deviation, ±4) / √(width of the column's group)`.
+    /// `clip((x − mean) / deviation, ±4) / √(width of the column's group)`. What was fitted when the up axis had
+    /// fewer columns takes the first of them.
     pub fn standardise(&self, raw: &Features) -> Features {
         let dim = self.mean.len();
-        assert_eq!(
-            raw.dim, dim,
-            "features and normalisation have the same columns"
+        assert!(
+            raw.dim == dim || (self.up_known && raw.dim > dim),
+            "features have the {dim} columns of the normalisation, not {}",
+            raw.dim
         );
         let mut scale = Vec::with_capacity(dim);
         for (_, width) in groups(self.up_known) {
+            let width = width.min(dim - scale.len());
             scale.extend(std::iter::repeat_n(1.0 / (width as f64).sqrt(), width));
         }
-        let standard = |(i, &x): (usize, &f32)| {
-            let c = i % dim;
-            let z = (f64::from(x) - self.mean[c]) / self.deviation[c];
-            (z.clamp(-CLIP, CLIP) * scale[c]) as f32
+        let standard = |row: &[f32]| -> Vec<f32> {
+            (0..dim)
+                .map(|c| {
+                    let z = (f64::from(row[c]) - self.mean[c]) / self.deviation[c];
+                    (z.clamp(-CLIP, CLIP) * scale[c]) as f32
+                })
+                .collect()
         };
         Features {
-            data: raw.data.iter().enumerate().map(standard).collect(),
+            data: raw.data.chunks_exact(raw.dim).flat_map(standard).collect(),
             dim,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_knew_fewer_columns_of_the_up_axis_reads_the_first() {
+        let n: usize = descriptors::GROUPS.iter().map(|g| g.1).sum();
+        let all = n + descriptors::N_UP_COLUMNS;
+        let raw = Features {
+            data: (0..2 * all).map(|i| (i % all) as f32).collect(),
+            dim: all,
+        };
+        let older = Normalisation {
+            mean: vec![0.0; n + 3],
+            deviation: vec![1e3; n + 3],
+            up_known: true,
+        };
+        let found = older.standardise(&raw);
+        assert_eq!((found.dim, found.data.len()), (n + 3, 2 * (n + 3)));
+        for row in found.data.chunks_exact(n + 3) {
+            let expected = (n + 2) as f64 / 1e3 / 3.0_f64.sqrt();
+            assert!((f64::from(row[n + 2]) - expected).abs() < 1e-6);
         }
     }
 }
