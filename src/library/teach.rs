@@ -16,7 +16,6 @@ use crate::labels::{Features, LabelModel, Normalisation, Statistics};
 use crate::pipeline::{DescriptionView, Given, Lesson, LessonMap, Prepared, TeachOptions, teach};
 use crate::segmentation::Surface;
 use crate::store::Tx;
-use nalgebra::DMatrix;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
@@ -218,11 +217,11 @@ impl Library {
             })
             .collect();
         let statistics = self.given(lane, &teaching, chosen, &model)?;
-        let scatter = self.discovered_scatter(lane, &teaching, &model)?;
+        let discovered = self.discovered_statistics(lane, &teaching, &model)?;
         let given = Given {
             statistics: &statistics,
             n_exemplars: lane.shapes.iter().filter(|s| s.pinned).count(),
-            scatter: scatter.as_ref(),
+            discovered: discovered.as_ref(),
         };
         let taught = teach(&lessons, &maps, &given, k, &TeachOptions::default());
         model.statistics = taught.statistics;
@@ -401,14 +400,14 @@ impl Library {
         Ok(given)
     }
 
-    /// Scatter of the descriptors within the labels as they were when discovery ended, where those labels do not count
-    /// any more; `None` also if there were less than two.
-    fn discovered_scatter(
+    /// Statistics of the labels as they were when discovery ended, where those labels do not count any more; `None` also
+    /// if there were less than two.
+    fn discovered_statistics(
         &self,
         lane: &Lane,
         teaching: &Teaching,
         model: &LabelModel,
-    ) -> Result<Option<DMatrix<f64>>> {
+    ) -> Result<Option<Statistics>> {
         let k = teaching.discovered_labels.len();
         if !teaching.closed || k < 2 {
             return Ok(None);
@@ -436,8 +435,7 @@ impl Library {
             let (features, area) = (&prepared.features, &prepared.surface.area);
             discovered.accumulate(&Statistics::of_shape(features, area, most, k), 1.0);
         }
-        let any = discovered.counts.iter().any(|n| *n > 0.0);
-        Ok(any.then(|| discovered.scatter_within()))
+        Ok((discovered.total() > 0.0).then_some(discovered))
     }
 }
 

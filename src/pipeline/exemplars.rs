@@ -8,15 +8,18 @@
 //! learnt labels every other shape with a vote and a cut: it does not change until the next correction, so the
 //! order in which those are labelled makes no difference.
 //!
-//! One exemplar shows what its parts are like, but not how much like parts of different shapes differ. That is taken from
-//! the labels that were discovered before: wrong as some are, descriptors scatter within them as within true parts.
+//! One exemplar shows what its parts are like, but not how much like parts of different shapes differ, nor what a part of
+//! its kind is like on average. Both are taken from the labels that were discovered before. Wrong as some are, descriptors
+//! scatter within them as within true parts; and what each of them means in the person's words, seen by the faces
+//! that both label, says where the means of the person's labels are to be expected: the estimate is that with a conjugate prior
+//! worth so many exemplars (Gauvain and Lee 1994, *Maximum a Posteriori Estimation for Multivariate Gaussian Mixture
+//! Observations of Markov Chains*), which fades as exemplars come.
 
 use super::place::{blended, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
 use crate::labels::cut::cut;
 use crate::labels::{Classifier, Statistics};
-use nalgebra::DMatrix;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 
 /// Weights of teaching.
@@ -35,9 +38,10 @@ pub struct TeachOptions {
     pub carried_weight: f64,
     /// Least probability of a face that the discriminant is trained on, if no person labelled it.
     pub confident: f64,
-    /// Exemplars that tell as much of how descriptors scatter within a label as the labels that were discovered: with n
-    /// of them, those have `scatter_exemplars / (scatter_exemplars + n)` of the say.
-    pub scatter_exemplars: f64,
+    /// Exemplars that tell as much as the labels that were discovered, of where the labels' means are and of how
+    /// descriptors scatter around them: with n exemplars, what was discovered has `discovered_exemplars /
+    /// (discovered_exemplars + n)` of the say.
+    pub discovered_exemplars: f64,
     /// Temperature of the discriminant, which is trained on few shapes and too certain.
     pub temperature: f64,
     /// Boundary strength of the cut.
@@ -53,7 +57,7 @@ impl Default for TeachOptions {
             pinned_weight: 4.0,
             carried_weight: 1.0,
             confident: 0.7,
-            scatter_exemplars: 2.0,
+            discovered_exemplars: 2.0,
             temperature: 2.0,
             strength: 3.0,
         }
@@ -102,9 +106,10 @@ pub struct Given<'a> {
     pub statistics: &'a Statistics,
     /// Exemplars, those among the lessons included.
     pub n_exemplars: usize,
-    /// Scatter `(dim, dim)` within the labels that were discovered before anything was labelled, over many shapes: how
-    /// descriptors differ between like parts of different shapes, of which a few exemplars say little.
-    pub scatter: Option<&'a DMatrix<f64>>,
+    /// Statistics of the labels that were discovered before anything was labelled, over many shapes, where they count
+    /// no more themselves: what parts are like on average, and how like parts of different shapes differ, of which a few
+    /// exemplars say little.
+    pub discovered: Option<&'a Statistics>,
 }
 
 /// Teaches the lessons `k` classes. Costs a cut for each lesson and round.
@@ -115,8 +120,10 @@ pub fn teach(
     k: usize,
     options: &TeachOptions,
 ) -> Taught {
-    let share = options.scatter_exemplars / (options.scatter_exemplars + given.n_exemplars as f64);
-    let with_scatter = |statistics: &Statistics| match given.scatter {
+    let worth = options.discovered_exemplars;
+    let share = worth / (worth + given.n_exemplars as f64);
+    let scatter = given.discovered.map(Statistics::scatter_within);
+    let with_scatter = |statistics: &Statistics| match &scatter {
         Some(scatter) => statistics.with_scatter(scatter, share),
         None => statistics.clone(),
     };
@@ -130,6 +137,13 @@ pub fn teach(
             k,
         );
         certain.accumulate(&of_shape, options.pinned_weight);
+    }
+    if let Some(discovered) = given.discovered {
+        let pinned = lessons.iter().filter(|l| !l.pinned.is_empty());
+        let labelled = pinned.map(|l| (&l.prepared.features, &*l.prepared.surface.area, l.pinned));
+        let prior = discovered.translated(&discovered.meaning(labelled, k), k);
+        let each = certain.total() / given.n_exemplars.max(1) as f64;
+        certain.accumulate(&prior, worth * each / prior.total().max(1e-12));
     }
     let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
     let mut statistics = with_scatter(&certain);
@@ -272,8 +286,7 @@ fn with_confident(
         );
         carried.accumulate(&of_shape, 1.0);
     }
-    let total = |s: &Statistics| s.counts.iter().sum::<f64>();
-    let weight = options.carried_weight * total(certain) / total(&carried).max(1e-12);
+    let weight = options.carried_weight * certain.total() / carried.total().max(1e-12);
     let mut all = certain.clone();
     all.accumulate(&carried, weight.min(1.0));
     all
