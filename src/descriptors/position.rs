@@ -10,7 +10,7 @@ pub(super) const N_COLUMNS: usize = 7;
 /// Columns of [`up_columns`].
 pub const N_UP_COLUMNS: usize = 5;
 /// Layers in which the area along the up axis is counted.
-const N_LAYERS: usize = 64;
+const N_LAYERS: usize = 256;
 /// Rounds of smoothing of the columns along the up axis, as of all face descriptors.
 const ROUNDS: usize = 2;
 /// Extents below this are none.
