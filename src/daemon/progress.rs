@@ -21,8 +21,8 @@ const FIRST_PACE: f64 = 0.5;
 /// Share of the newest shape in the pace.
 const PACE_WEIGHT: f64 = 0.1;
 
-fn units_of(n_bytes: u64) -> f64 {
-    1.0 + n_bytes as f64 / UNIT_BYTES
+fn units_of(n_shapes: usize, n_bytes: u64) -> f64 {
+    n_shapes as f64 + n_bytes as f64 / UNIT_BYTES
 }
 
 /// What is accepted and not placed, with an estimate of the time it takes.
@@ -40,9 +40,9 @@ impl Load {
         self.units * self.pace
     }
 
-    /// Seconds for a shape of `n_bytes` more.
-    pub(crate) fn seconds_of(&self, n_bytes: u64) -> f64 {
-        units_of(n_bytes) * self.pace
+    /// Seconds for shapes of together `n_bytes` more.
+    pub(crate) fn seconds_of(&self, n_shapes: usize, n_bytes: u64) -> f64 {
+        units_of(n_shapes, n_bytes) * self.pace
     }
 }
 
@@ -70,6 +70,8 @@ pub(crate) struct Progress<S> {
     jobs: HashMap<u64, LiveJob>,
     /// Bytes of the file of each live shape, by job and index.
     sizes: HashMap<(u64, u32), u64>,
+    /// Room that is reserved: shapes, and bytes of their files.
+    reserved: (usize, u64),
     /// Seconds that a unit of work has taken lately.
     pace: f64,
     /// Jobs are numbered in order of acceptance; this is the last one taken up.
@@ -85,6 +87,7 @@ impl<S> Progress<S> {
             turns: VecDeque::new(),
             jobs: HashMap::new(),
             sizes: HashMap::new(),
+            reserved: (0, 0),
             pace: FIRST_PACE,
             highest_job: 0,
             n_changes: 0,
@@ -223,15 +226,29 @@ impl<S> Progress<S> {
 
     /// Notes how long a shape has taken, divided by the number of those that are done side by side.
     pub(crate) fn note_pace(&mut self, n_bytes: u64, secs: f64) {
-        self.pace += (secs / units_of(n_bytes) - self.pace) * PACE_WEIGHT;
+        self.pace += (secs / units_of(1, n_bytes) - self.pace) * PACE_WEIGHT;
     }
 
-    /// What is accepted and not placed.
+    /// Reserves room for shapes that are being taken in.
+    pub(crate) fn reserve(&mut self, n_bytes: &[u64]) {
+        self.reserved.0 += n_bytes.len();
+        self.reserved.1 += n_bytes.iter().sum::<u64>();
+    }
+
+    /// Gives back what was reserved.
+    pub(crate) fn release(&mut self, n_bytes: &[u64]) {
+        self.reserved.0 -= n_bytes.len();
+        self.reserved.1 -= n_bytes.iter().sum::<u64>();
+    }
+
+    /// What is accepted and not placed, and what is reserved.
     pub(crate) fn load(&self) -> Load {
+        let n_shapes = self.sizes.len() + self.reserved.0;
+        let n_bytes = self.sizes.values().sum::<u64>() + self.reserved.1;
         Load {
-            n_shapes: self.sizes.len(),
-            n_bytes: self.sizes.values().sum(),
-            units: self.sizes.values().map(|&n| units_of(n)).sum(),
+            n_shapes,
+            n_bytes,
+            units: units_of(n_shapes, n_bytes),
             pace: self.pace,
         }
     }

@@ -5,10 +5,13 @@
 use crate::daemon::fair::{Gate, Turn};
 use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
-use crate::daemon::{Daemon, asked, blocking, reads, writes};
+use crate::daemon::writes::{self, Room};
+use crate::daemon::{Daemon, asked, blocking, reads};
 use crate::ipc::convert;
-use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body};
-use crate::library::Job;
+use crate::ipc::wire::{
+    self, AddShapesRequest, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body,
+};
+use crate::library::{Job, RequestKey};
 use bytes::Bytes;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -25,6 +28,8 @@ const WATCH_PACE: Duration = Duration::from_millis(50);
 const MAX_GATES: usize = 1_024;
 /// Reads that run at a time beyond the workers; they mostly wait for the disk.
 const EXTRA_READS: usize = 2;
+/// Requests whose files are written at a time: while one waits for the disk, others compress.
+const MAX_KEEPING: usize = 16;
 
 /// The result and raw frames of a reply.
 pub(crate) type Answer = Result<(reply::Result, Vec<Bytes>), wire::Error>;
@@ -40,6 +45,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     // What queues up at the gates is bounded by the permits.
     let readers = Gate::new(daemon.n_workers + EXTRA_READS);
     let computing = Gate::new(daemon.n_workers);
+    let keeping = Gate::new(MAX_KEEPING);
     let intake = Gate::new(1);
     let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
@@ -61,13 +67,6 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
         let in_hand = InHand { incoming, permit };
         let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
-        // At once: what is refused keeps nobody waiting for what is taken in.
-        if let Body::AddShapes(r) = &body
-            && let Err(full) = writes::look_for_room(&daemon, r.shapes.len())
-        {
-            in_hand.finish(&daemon, Err(full));
-            continue;
-        }
         // Changes of labels may wait while a lane learns; nothing else waits with them.
         let gate = changed_collection(&body).map(|name| {
             if collections.len() >= MAX_GATES {
@@ -85,13 +84,25 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::Undo(_)
             | Body::RemoveShape(_)
             | Body::CreateCollection(_)
-            | Body::AddShapes(_)
             | Body::CancelJob(_)
             | Body::RetryJob(_)
             | Body::Drain(_) => {
                 let turn = gate.as_ref().unwrap_or(&intake).queue(&client);
-                tokio::spawn(change_in_turn(daemon, body, in_hand, turn));
+                let mut in_hand = in_hand;
+                let frames = std::mem::take(&mut in_hand.incoming.frames);
+                let change = move |d: &Arc<Daemon>, key: Option<&RequestKey>| {
+                    writes::change(d, &body, &frames, key)
+                };
+                tokio::spawn(change_in_turn(daemon, change, in_hand, turn));
             }
+            // At once: what is refused keeps nobody waiting for what is taken in.
+            Body::AddShapes(request) => match Room::reserve(&daemon, request.shapes.len()) {
+                Err(full) => in_hand.finish(&daemon, Err(full)),
+                Ok(room) => {
+                    let turns = (keeping.queue(&client), intake.queue(&client));
+                    tokio::spawn(add_in_turn(daemon, request, room, in_hand, turns));
+                }
+            },
             Body::WatchJob(request) => {
                 tokio::spawn(in_hand.respond(daemon, async move |d| watch_job(&d, &request).await));
             }
@@ -170,8 +181,47 @@ fn changed_collection(body: &Body) -> Option<&str> {
     })
 }
 
+/// Takes in shapes: their files are written beside those of others, and accepted in turn.
+async fn add_in_turn(
+    daemon: Arc<Daemon>,
+    request: AddShapesRequest,
+    room: Room,
+    mut in_hand: InHand,
+    (keeping, turn): (Turn, Turn),
+) {
+    let Some(pass) = in_hand.by_deadline(keeping.come()).await else {
+        return in_hand.late(&daemon, Late::NotBegun);
+    };
+    let key = writes::key(&in_hand.incoming.request);
+    let frames = std::mem::take(&mut in_hand.incoming.frames);
+    // Given back when the files are there.
+    let memory = in_hand.incoming.memory.take();
+    let kept = blocking(&daemon, move |d| {
+        let _here = (memory, pass);
+        let frames = frames;
+        writes::keep(d, request, &frames, room, key.as_ref())
+    });
+    let Some(kept) = in_hand.by_deadline(kept).await else {
+        return in_hand.late(&daemon, Late::NotBegun);
+    };
+    in_hand.incoming.ticket.free_bytes();
+    match kept.unwrap_or_else(|panic| Err(panic_error(&panic))) {
+        Err(error) => in_hand.finish(&daemon, Err(error)),
+        Ok(addition) => {
+            let accept =
+                move |d: &Arc<Daemon>, key: Option<&RequestKey>| writes::accept(d, &addition, key);
+            change_in_turn(daemon, accept, in_hand, turn).await;
+        }
+    }
+}
+
 /// Carries out a change when its turn comes.
-async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, turn: Turn) {
+async fn change_in_turn<F>(daemon: Arc<Daemon>, change: F, mut in_hand: InHand, turn: Turn)
+where
+    F: FnOnce(&Arc<Daemon>, Option<&RequestKey>) -> Result<writes::Done, wire::Error>
+        + Send
+        + 'static,
+{
     let Some(pass) = in_hand.by_deadline(turn.come()).await else {
         return in_hand.late(&daemon, Late::NotBegun);
     };
@@ -179,15 +229,13 @@ async fn change_in_turn(daemon: Arc<Daemon>, body: Body, mut in_hand: InHand, tu
         return in_hand.late(&daemon, Late::NotBegun);
     }
     let key = writes::key(&in_hand.incoming.request);
-    let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the change is made: who waits for the placing holds no frames.
     let memory = in_hand.incoming.memory.take();
     let changing = Arc::clone(&daemon);
     let mut done = tokio::spawn(async move {
         let done = blocking(&changing, move |d| {
             let _memory = memory;
-            let (body, frames) = (body, frames);
-            writes::change(d, &body, &frames, key.as_ref())
+            change(d, key.as_ref())
         });
         let done = done.await;
         drop(pass);

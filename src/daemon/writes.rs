@@ -1,7 +1,7 @@
 //! Requests that change something, carried out one after the other.
 
 use crate::config;
-use crate::daemon::progress::Waiting;
+use crate::daemon::progress::{Load, Waiting};
 use crate::daemon::publish::Notice;
 use crate::daemon::requests::draining;
 use crate::daemon::{Daemon, asked};
@@ -9,7 +9,7 @@ use crate::ipc::convert;
 use crate::ipc::endpoint::Endpoint;
 use crate::ipc::frames::FrameReader;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply, request::Body};
-use crate::library::{LibraryError, RequestKey};
+use crate::library::{KeptShapes, LibraryError, RequestKey};
 use bytes::Bytes;
 use std::io::Read as _;
 use std::path::Path;
@@ -46,17 +46,7 @@ pub(crate) fn change(
     if let Body::Drain(_) = body {
         return drain(daemon).map(|reply| Done::Now(Box::new(reply)));
     }
-    if daemon.is_draining() {
-        return Err(draining());
-    }
-    if key.is_some_and(|k| k.request_id.is_empty()) {
-        let text = "a change by a named client needs a request_id";
-        return Err(convert::field_error(
-            ErrorReason::FieldMissing,
-            "request_id",
-            text,
-        ));
-    }
+    may_change(daemon, key)?;
     let library = &daemon.library;
     let reply = match body {
         Body::CreateCollection(r) => {
@@ -112,10 +102,25 @@ pub(crate) fn change(
                 n_queued,
             })
         }
-        Body::AddShapes(r) => return add_shapes(daemon, r, frames, key),
         other => unreachable!("invariant: dispatch sends only changes here, not {other:?}"),
     };
     Ok(Done::Now(Box::new(reply)))
+}
+
+/// Whether changes are taken, and by whom this one is can be told.
+fn may_change(daemon: &Daemon, key: Option<&RequestKey>) -> Result<(), wire::Error> {
+    if daemon.is_draining() {
+        return Err(draining());
+    }
+    if key.is_some_and(|k| k.request_id.is_empty()) {
+        let text = "a change by a named client needs a request_id";
+        return Err(convert::field_error(
+            ErrorReason::FieldMissing,
+            "request_id",
+            text,
+        ));
+    }
+    Ok(())
 }
 
 fn refuse(e: LibraryError) -> wire::Error {
@@ -134,12 +139,65 @@ fn drain(daemon: &Daemon) -> Result<Reply, wire::Error> {
     Ok(Reply::Drain(wire::DrainReply { n_queued }))
 }
 
-fn add_shapes(
+/// Room in the queue for shapes that are being taken in, given back when dropped.
+pub(crate) struct Room {
+    daemon: Arc<Daemon>,
+    n_bytes: Vec<u64>,
+}
+
+impl Room {
+    /// Reserves room for so many shapes, whatever their size, or refuses them.
+    pub(crate) fn reserve(daemon: &Arc<Daemon>, n_shapes: usize) -> Result<Self, wire::Error> {
+        let mut room = Self {
+            daemon: Arc::clone(daemon),
+            n_bytes: Vec::new(),
+        };
+        // Where nothing is taken in, that is the reason to tell; what can never be taken in is looked at
+        // closely, and told what is wrong with it.
+        match room.resize(vec![0; n_shapes]) {
+            Err(full) if full.code() == ErrorCode::ResourceExhausted && !daemon.is_draining() => {
+                Err(full)
+            }
+            _ => Ok(room),
+        }
+    }
+
+    /// Reserves room for shapes of so many bytes in place of what is reserved, which is kept if there is none: by number, by
+    /// bytes, and by the time that placing all of them is estimated to take.
+    fn resize(&mut self, n_bytes: Vec<u64>) -> Result<(), wire::Error> {
+        let mut progress = self.daemon.work.progress();
+        progress.release(&self.n_bytes);
+        let admitted = admit(&self.daemon, &progress.load(), &n_bytes);
+        if admitted.is_ok() {
+            self.n_bytes = n_bytes;
+        }
+        progress.reserve(&self.n_bytes);
+        admitted
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.daemon.work.progress().release(&self.n_bytes);
+    }
+}
+
+/// Shapes whose files are durable, to be accepted in turn.
+pub(crate) struct Addition {
+    request: wire::AddShapesRequest,
+    shapes: KeptShapes,
+    room: Room,
+}
+
+/// Writes the files of shapes, durably.
+pub(crate) fn keep(
     daemon: &Arc<Daemon>,
-    request: &wire::AddShapesRequest,
+    request: wire::AddShapesRequest,
     frames: &[Bytes],
+    mut room: Room,
     key: Option<&RequestKey>,
-) -> Result<Done, wire::Error> {
+) -> Result<Addition, wire::Error> {
+    may_change(daemon, key)?;
     let config = daemon.config();
     let (limits, roots) = (&config.limits, &config.ingest.paths);
     let max_shape_bytes = limits.shape_bytes();
@@ -149,17 +207,39 @@ fn add_shapes(
         max_shape_bytes,
         read_path: &read_path,
     };
-    let shapes = convert::new_shapes(request, FrameReader::new(frames), &ingest)?;
-    let n_bytes: Vec<u64> = shapes.iter().map(|s| s.bytes.len() as u64).collect();
-    admit(daemon, &n_bytes)?;
+    let shapes = convert::new_shapes(&request, FrameReader::new(frames), &ingest)?;
+    room.resize(shapes.iter().map(|s| s.bytes.len() as u64).collect())?;
+    if request.create.is_none() {
+        // Before anything is written.
+        daemon
+            .library
+            .collection(&request.collection)
+            .map_err(refuse)?;
+    }
+    let shapes = daemon.library.keep(shapes).map_err(refuse)?;
+    Ok(Addition {
+        request,
+        shapes,
+        room,
+    })
+}
+
+/// Accepts shapes whose files are there, durably.
+pub(crate) fn accept(
+    daemon: &Arc<Daemon>,
+    addition: &Addition,
+    key: Option<&RequestKey>,
+) -> Result<Done, wire::Error> {
+    may_change(daemon, key)?;
+    let request = &addition.request;
     if let Some(create) = &request.create {
         ensure_collection(daemon, &request.collection, create)?;
     }
     let job = daemon
         .library
-        .submit(&request.collection, shapes, key)
+        .submit(&request.collection, &addition.shapes, key)
         .map_err(refuse)?;
-    daemon.take_up(&job, &n_bytes);
+    daemon.take_up(&job, &addition.room.n_bytes);
     match request.mode() {
         wire::AddMode::Wait => Ok(Done::WhenPlaced(job.id)),
         wire::AddMode::Job | wire::AddMode::Unspecified => {
@@ -169,26 +249,11 @@ fn add_shapes(
     }
 }
 
-/// Refuses so many shapes for which the queue has no room whatever their size.
-pub(crate) fn look_for_room(daemon: &Daemon, n_shapes: usize) -> Result<(), wire::Error> {
-    // Where nothing is taken in, that is the reason to tell.
-    if daemon.is_draining() {
-        return Ok(());
-    }
-    match admit(daemon, &vec![0; n_shapes]) {
-        Err(full) if full.code() == ErrorCode::ResourceExhausted => Err(full),
-        // What can never be taken in is looked at closely, and told what is wrong with it.
-        _ => Ok(()),
-    }
-}
-
-/// Refuses shapes for which the queue has no room: by number, by bytes, and by the time that placing all of
-/// them is estimated to take.
-fn admit(daemon: &Daemon, n_bytes: &[u64]) -> Result<(), wire::Error> {
+/// Refuses shapes for which a queue with that load has no room.
+fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Error> {
     let limits = &daemon.config().limits;
     let (n, bytes) = (n_bytes.len(), n_bytes.iter().sum::<u64>());
-    let load = daemon.work.progress().load();
-    let secs = n_bytes.iter().map(|&b| load.seconds_of(b)).sum::<f64>();
+    let secs = load.seconds_of(n, bytes);
     let max_secs = limits.max_queued_seconds as f64;
     let max_shapes = limits.max_queued_shapes as f64;
     let max_bytes = limits.max_queued_bytes.0 as f64;

@@ -243,7 +243,9 @@ mod tests {
                 replace: false,
             };
             let [first, second] = holders.each_ref().map(|holder| {
-                let job = holder.submit("c", vec![shape.clone()], None).unwrap();
+                let job = holder
+                    .submit("c", &holder.keep(vec![shape.clone()]).unwrap(), None)
+                    .unwrap();
                 let described = holder.describe_item(&job.items[0], &|_| true).unwrap();
                 (job, described)
             });

@@ -12,7 +12,8 @@ use crate::mesh::{CleanError, ParseError};
 use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params};
 use crate::spectrum::SpectrumError;
 use crate::store::{
-    CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, RequestRow, ShapeRow, Tx,
+    CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, ObjectRow, RequestRow,
+    ShapeRow, Tx,
 };
 use std::cell::RefCell;
 use std::sync::PoisonError;
@@ -20,45 +21,61 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 const MAX_SHAPE_NAME: usize = 255;
 
+/// Shapes whose files are durable, and that count once they are submitted.
+#[derive(Debug, Default)]
+pub struct KeptShapes {
+    objects: Vec<ObjectRow>,
+    items: Vec<NewJobItem>,
+}
+
 impl Library {
-    /// Accepts shapes: when this returns their bytes and a job are durable. The same key gives the same job again.
+    /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may do so at a time.
     ///
     /// # Errors
-    /// No such collection, a bad name, or a key that was used for another request.
-    pub fn submit(
-        &self,
-        collection: &str,
-        shapes: Vec<NewShape>,
-        key: Option<&RequestKey>,
-    ) -> Result<Job> {
-        let mut request = blake3::Hasher::new();
-        request.update(format!("submit {collection:?} {}", shapes.len()).as_bytes());
+    /// A bad name; the disk.
+    pub fn keep(&self, shapes: Vec<NewShape>) -> Result<KeptShapes> {
         for s in &shapes {
             check_name("shape", &s.name, MAX_SHAPE_NAME)?;
-            let what = format!("{:?} {} {}", s.name, s.format.name(), s.replace);
-            request
-                .update(what.as_bytes())
-                .update(&Digest::of(&s.bytes).0);
         }
-        let request = Digest(*request.finalize().as_bytes());
-        self.collection_row(collection)?;
-        let mut objects = Vec::new();
-        let mut items = Vec::new();
+        let mut kept = KeptShapes::default();
         for s in shapes {
             let object = self.store.objects().put_original(&s.bytes)?;
-            items.push(NewJobItem {
+            kept.items.push(NewJobItem {
                 name: s.name,
                 original_digest: object.digest,
                 format: s.format.name().into(),
                 replace: s.replace,
             });
-            objects.push(object);
+            kept.objects.push(object);
         }
+        Ok(kept)
+    }
+
+    /// Accepts shapes: when this returns a job with them is durable. The same key gives the same job again.
+    ///
+    /// # Errors
+    /// No such collection, or a key that was used for another request.
+    pub fn submit(
+        &self,
+        collection: &str,
+        shapes: &KeptShapes,
+        key: Option<&RequestKey>,
+    ) -> Result<Job> {
+        let mut request = blake3::Hasher::new();
+        request.update(format!("submit {collection:?} {}", shapes.items.len()).as_bytes());
+        for item in &shapes.items {
+            let what = format!("{:?} {} {}", item.name, item.format, item.replace);
+            request
+                .update(what.as_bytes())
+                .update(&item.original_digest.0);
+        }
+        let request = Digest(*request.finalize().as_bytes());
+        self.collection_row(collection)?;
         let reply = self.once(key, request, |tx| {
-            for object in &objects {
+            for object in &shapes.objects {
                 tx.insert_object(object)?;
             }
-            let job = tx.insert_job(collection, unix_secs(), &items)?;
+            let job = tx.insert_job(collection, unix_secs(), &shapes.items)?;
             Ok(job.to_le_bytes().to_vec())
         })?;
         let id = reply.as_slice().try_into().map(u64::from_le_bytes);
@@ -301,7 +318,7 @@ impl Library {
     /// # Errors
     /// As [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
     pub fn add(&self, collection: &str, shape: NewShape) -> Result<Placed> {
-        let job = self.submit(collection, vec![shape], None)?;
+        let job = self.submit(collection, &self.keep(vec![shape])?, None)?;
         let item = &job.items[0];
         match self.place_item(item, self.describe_item(item, &|_| true))? {
             ItemState::Done(placed) => Ok(*placed),

@@ -39,8 +39,9 @@ pub struct Objects {
     disk: Arc<dyn Disk>,
     root: PathBuf,
     health: Health,
-    /// One file is published at a time, so that nobody finds a name that may yet be taken back.
-    publishing: Mutex<()>,
+    /// One file of a name is published at a time, so that nobody finds a name that may yet be taken back. By the first
+    /// digits, so that files under different folders do not wait for each other.
+    publishing: [Mutex<()>; 256],
     state: Mutex<State>,
 }
 
@@ -79,7 +80,7 @@ impl Objects {
             disk,
             root: root.to_path_buf(),
             health,
-            publishing: Mutex::new(()),
+            publishing: std::array::from_fn(|_| Mutex::new(())),
             state: Mutex::new(State {
                 held: HashMap::new(),
                 durable_folders: HashSet::new(),
@@ -211,8 +212,7 @@ impl Objects {
         self.health.writable()?;
         let hex = digest.to_string();
         let folder = format!("{}/{}", kind.folder(), &hex[..2]);
-        let _publishing = self
-            .publishing
+        let _publishing = self.publishing[usize::from(digest.0[0])]
             .lock()
             .unwrap_or_else(PoisonError::into_inner);
         self.make_folder(kind.folder(), &folder)?;

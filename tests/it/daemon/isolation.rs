@@ -148,7 +148,9 @@ fn attempts_are_counted_across_restarts() {
         format: coseg::mesh::Format::Off,
         replace: false,
     };
-    let job = library.submit("c", vec![shape], None).unwrap();
+    let job = library
+        .submit("c", &library.keep(vec![shape]).unwrap(), None)
+        .unwrap();
     for attempt in 1..=2 {
         assert_eq!(
             library.note_attempt(&job.items[0], "it aborted").unwrap(),
