@@ -382,7 +382,7 @@ pub(crate) struct Export {
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: ExportFormat,
     /// Folder to write to, created if missing
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, short, value_name = "DIR")]
     pub(crate) out: PathBuf,
     /// Do not wait for shapes and relabellings that are queued
     #[arg(long)]

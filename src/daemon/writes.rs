@@ -189,7 +189,8 @@ pub(crate) struct Addition {
     room: Room,
 }
 
-/// Writes the files of shapes, durably.
+/// Writes the files of shapes, durably. Whether there is such a collection shows when it is their turn: a request before
+/// theirs may create it.
 pub(crate) fn keep(
     daemon: &Arc<Daemon>,
     request: wire::AddShapesRequest,
@@ -209,13 +210,6 @@ pub(crate) fn keep(
     };
     let shapes = convert::new_shapes(&request, FrameReader::new(frames), &ingest)?;
     room.resize(shapes.iter().map(|s| s.bytes.len() as u64).collect())?;
-    if request.create.is_none() {
-        // Before anything is written.
-        daemon
-            .library
-            .collection(&request.collection)
-            .map_err(refuse)?;
-    }
     let shapes = daemon.library.keep(shapes).map_err(refuse)?;
     Ok(Addition {
         request,

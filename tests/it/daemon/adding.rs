@@ -236,6 +236,56 @@ fn settings_that_differ_are_refused() {
     }
 }
 
+/// Files are written side by side, so that a small one is there before a large one that was sent earlier.
+#[test]
+fn what_one_client_sends_takes_effect_in_its_order() {
+    let home = Home::new();
+    let daemon = home.start();
+    let dealer = raw(zmq::DEALER, &daemon.endpoint);
+    let large = format!("{}{}", skittle(0), "# nothing\n".repeat(2 << 20));
+    let small: Vec<String> = (1..8).map(skittle).collect();
+    let send = |id: usize, body: request::Body, frames: &[bytes::Bytes]| {
+        let request = Request {
+            request_id: id.to_string(),
+            body: Some(body),
+            ..Default::default()
+        };
+        let mut message = vec![request.encode_to_vec()];
+        message.extend(frames.iter().map(|f| f.to_vec()));
+        dealer.send_multipart(message, 0).unwrap();
+    };
+    let spec = wire::CollectionSpec {
+        name: "c".to_owned(),
+        n_parts: Some(2),
+        ..Default::default()
+    };
+    let create = wire::CreateCollectionRequest { spec: Some(spec) };
+    send(0, request::Body::CreateCollection(create), &[]);
+    for (i, text) in std::iter::once(&large).chain(&small).enumerate() {
+        let name = format!("s{i}");
+        let (body, frames) = add_request("c", &[(&name, text)], wire::AddMode::Job);
+        let request::Body::AddShapes(mut adding) = body else {
+            unreachable!()
+        };
+        adding.create = None;
+        send(1 + i, request::Body::AddShapes(adding), &frames);
+    }
+    let mut jobs = Vec::new();
+    for _ in 0..=8 {
+        let reply = wire::Reply::decode(dealer.recv_multipart(0).unwrap()[0].as_slice()).unwrap();
+        match reply.result.unwrap() {
+            reply::Result::CreateCollection(_) => {}
+            reply::Result::AddShapes(added) => {
+                jobs.push((added.job_id, reply.request_id.parse::<usize>().unwrap()));
+            }
+            other => panic!("unexpected: {other:?}"),
+        }
+    }
+    jobs.sort_unstable();
+    let order: Vec<usize> = jobs.iter().map(|job| job.1).collect();
+    assert_eq!(order, (1..=8).collect::<Vec<_>>());
+}
+
 #[test]
 fn a_deadline_ends_the_wait_and_not_the_work() {
     let home = Home::new();
