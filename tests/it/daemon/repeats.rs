@@ -45,14 +45,25 @@ fn send_each_again_and_again(seed: u64) {
         label: 7,
         name: "leg".to_owned(),
     });
+    let split = Body::SplitLabel(wire::SplitLabelRequest {
+        collection: c(),
+        label: 1,
+    });
+    let merge = Body::MergeLabels(wire::MergeLabelsRequest {
+        collection: c(),
+        label: 7,
+        into: 1,
+    });
     let undo = Body::Undo(wire::UndoRequest { collection: c() });
     let requests = [
         add("a", 0),
         add("b", 1),
         add("x", 2),
         (remove, vec![]),
+        (split, vec![]),
         (correct, vec![]),
         (name, vec![]),
+        (merge, vec![]),
         (undo, vec![]),
     ];
     let connect = |daemon: &Daemon| {
@@ -77,7 +88,7 @@ fn send_each_again_and_again(seed: u64) {
         wait_idle(&mut client, "c");
         replies.push(first);
         let events = events_since(&mut client, "c");
-        if i == 2 || i == 4 {
+        if [2, 4, 7].contains(&i) {
             daemon.signal(Signal::KILL);
             drop(daemon.ended());
             daemon = home.start();
