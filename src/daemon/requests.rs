@@ -64,7 +64,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
-        let in_hand = InHand { incoming, permit };
+        let mut in_hand = InHand { incoming, permit };
         let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
         // Changes of labels may wait while a lane learns; nothing else waits with them.
@@ -88,7 +88,6 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::RetryJob(_)
             | Body::Drain(_) => {
                 let turn = gate.as_ref().unwrap_or(&intake).queue(&client);
-                let mut in_hand = in_hand;
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 let change = move |d: &Arc<Daemon>, key: Option<&RequestKey>| {
                     writes::change(d, &body, &frames, key)
@@ -136,7 +135,6 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::EventsSince(_) => {
                 let turn = readers.queue(&client);
                 let computing = Arc::clone(&computing);
-                let mut in_hand = in_hand;
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
                     let pass = turn.come().await;
@@ -198,7 +196,6 @@ async fn add_in_turn(
     let memory = in_hand.incoming.memory.take();
     let kept = blocking(&daemon, move |d| {
         let _here = (memory, pass);
-        let frames = frames;
         writes::keep(d, request, &frames, room, key.as_ref())
     });
     let Some(kept) = in_hand.by_deadline(kept).await else {

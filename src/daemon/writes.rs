@@ -107,7 +107,7 @@ pub(crate) fn change(
     Ok(Done::Now(Box::new(reply)))
 }
 
-/// Whether changes are taken, and by whom this one is can be told.
+/// Refuses changes while the daemon drains, and those of a named client without an id.
 fn may_change(daemon: &Daemon, key: Option<&RequestKey>) -> Result<(), wire::Error> {
     if daemon.is_draining() {
         return Err(draining());

@@ -122,16 +122,15 @@ impl Normalisation {
             let width = width.min(dim - scale.len());
             scale.extend(std::iter::repeat_n(1.0 / (width as f64).sqrt(), width));
         }
-        let standard = |row: &[f32]| -> Vec<f32> {
-            (0..dim)
-                .map(|c| {
-                    let z = (f64::from(row[c]) - self.mean[c]) / self.deviation[c];
-                    (z.clamp(-CLIP, CLIP) * scale[c]) as f32
-                })
-                .collect()
+        let standard = |(c, &x): (usize, &f32)| {
+            let z = (f64::from(x) - self.mean[c]) / self.deviation[c];
+            (z.clamp(-CLIP, CLIP) * scale[c]) as f32
         };
+        let rows = raw.data.chunks_exact(raw.dim).map(|row| &row[..dim]);
         Features {
-            data: raw.data.chunks_exact(raw.dim).flat_map(standard).collect(),
+            data: rows
+                .flat_map(|row| row.iter().enumerate().map(standard))
+                .collect(),
             dim,
         }
     }
