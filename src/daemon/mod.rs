@@ -10,6 +10,7 @@ mod access;
 mod asked;
 mod fair;
 mod http;
+mod intake;
 mod memory;
 mod metrics;
 mod placing;

@@ -2,16 +2,17 @@
 //! other, what is taken in likewise, waits hold no thread. Where requests queue up, clients take turns; what is to be
 //! computed queues up apart from what is only looked up.
 
-use crate::daemon::fair::{Gate, Turn};
+use crate::daemon::fair::{Gate, Pass, Turn};
+use crate::daemon::intake::{self, Intake, Room};
 use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
-use crate::daemon::writes::{self, Room};
+use crate::daemon::writes;
 use crate::daemon::{Daemon, asked, blocking, reads};
 use crate::ipc::convert;
 use crate::ipc::wire::{
     self, AddShapesRequest, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body,
 };
-use crate::library::{Job, RequestKey};
+use crate::library::Job;
 use bytes::Bytes;
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -46,7 +47,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     let readers = Gate::new(daemon.n_workers + EXTRA_READS);
     let computing = Gate::new(daemon.n_workers);
     let keeping = Gate::new(MAX_KEEPING);
-    let intake = Gate::new(1);
+    let intake = Intake::new(&daemon);
     let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
         let Ok(permit) = Arc::clone(&daemon.pending).try_acquire_owned() else {
@@ -86,20 +87,23 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::CreateCollection(_)
             | Body::CancelJob(_)
             | Body::RetryJob(_)
-            | Body::Drain(_) => {
-                let turn = gate.as_ref().unwrap_or(&intake).queue(&client);
-                let frames = std::mem::take(&mut in_hand.incoming.frames);
-                let change = move |d: &Arc<Daemon>, key: Option<&RequestKey>| {
-                    writes::change(d, &body, &frames, key)
-                };
-                tokio::spawn(change_in_turn(daemon, change, in_hand, turn));
-            }
+            | Body::Drain(_) => match &gate {
+                Some(gate) => {
+                    let turn = gate.queue(&client).come();
+                    tokio::spawn(change_in_turn(daemon, body, in_hand, turn));
+                }
+                None => {
+                    let turn = intake.queue_alone(&client);
+                    tokio::spawn(change_in_turn(daemon, body, in_hand, turn));
+                }
+            },
             // At once: what is refused keeps nobody waiting for what is taken in.
             Body::AddShapes(request) => match Room::reserve(&daemon, request.shapes.len()) {
                 Err(full) => in_hand.finish(&daemon, Err(full)),
                 Ok(room) => {
                     let turns = (keeping.queue(&client), intake.queue(&client));
-                    tokio::spawn(add_in_turn(daemon, request, room, in_hand, turns));
+                    let intake = Arc::clone(&intake);
+                    tokio::spawn(add_in_turn(daemon, intake, request, room, in_hand, turns));
                 }
             },
             Body::WatchJob(request) => {
@@ -182,6 +186,7 @@ fn changed_collection(body: &Body) -> Option<&str> {
 /// Takes in shapes: their files are written beside those of others, and accepted in turn.
 async fn add_in_turn(
     daemon: Arc<Daemon>,
+    intake: Arc<Intake>,
     request: AddShapesRequest,
     room: Room,
     mut in_hand: InHand,
@@ -196,73 +201,59 @@ async fn add_in_turn(
     let memory = in_hand.incoming.memory.take();
     let kept = blocking(&daemon, move |d| {
         let _here = (memory, pass);
-        writes::keep(d, request, &frames, room, key.as_ref())
+        intake::keep(d, request, &frames, room, key)
     });
     let Some(kept) = in_hand.by_deadline(kept).await else {
         return in_hand.late(&daemon, Late::NotBegun);
     };
     in_hand.incoming.ticket.free_bytes();
-    match kept.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-        Err(error) => in_hand.finish(&daemon, Err(error)),
-        Ok(addition) => {
-            let accept =
-                move |d: &Arc<Daemon>, key: Option<&RequestKey>| writes::accept(d, &addition, key);
-            change_in_turn(daemon, accept, in_hand, turn).await;
-        }
-    }
+    let addition = match kept.unwrap_or_else(|panic| Err(panic_error(&panic))) {
+        Ok(addition) => addition,
+        Err(error) => return in_hand.finish(&daemon, Err(error)),
+    };
+    let Some(pass) = in_hand.turn(turn.come()).await else {
+        return in_hand.late(&daemon, Late::NotBegun);
+    };
+    let accepted = intake.accept(addition);
+    drop(pass);
+    let accepted = async {
+        accepted
+            .await
+            .unwrap_or_else(|e| Err(panic_error(&e.to_string())))
+    };
+    in_hand.answer_change(daemon, accepted).await;
 }
 
 /// Carries out a change when its turn comes.
-async fn change_in_turn<F>(daemon: Arc<Daemon>, change: F, mut in_hand: InHand, turn: Turn)
-where
-    F: FnOnce(&Arc<Daemon>, Option<&RequestKey>) -> Result<writes::Done, wire::Error>
-        + Send
-        + 'static,
-{
-    let Some(pass) = in_hand.by_deadline(turn.come()).await else {
+async fn change_in_turn(
+    daemon: Arc<Daemon>,
+    change: Body,
+    mut in_hand: InHand,
+    turn: impl Future<Output = Pass>,
+) {
+    let Some(pass) = in_hand.turn(turn).await else {
         return in_hand.late(&daemon, Late::NotBegun);
     };
-    if in_hand.is_late() {
-        return in_hand.late(&daemon, Late::NotBegun);
-    }
     let key = writes::key(&in_hand.incoming.request);
+    let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the change is made: who waits for the placing holds no frames.
     let memory = in_hand.incoming.memory.take();
     let changing = Arc::clone(&daemon);
-    let mut done = tokio::spawn(async move {
+    // It goes on, and keeps its turn, when nobody waits for it any more.
+    let done = tokio::spawn(async move {
         let done = blocking(&changing, move |d| {
             let _memory = memory;
-            change(d, key.as_ref())
+            writes::change(d, &change, &frames, key.as_ref())
         });
         let done = done.await;
         drop(pass);
-        done
+        done.unwrap_or_else(|panic| Err(panic_error(&panic)))
     });
-    let Some(done) = in_hand.by_deadline(&mut done).await else {
-        // It keeps its turn.
-        return in_hand.late(&daemon, Late::GoesOn);
+    let done = async {
+        done.await
+            .unwrap_or_else(|e| Err(panic_error(&e.to_string())))
     };
-    let done = done.unwrap_or_else(|e| Err(e.to_string()));
-    in_hand.incoming.ticket.free_bytes();
-    match done.unwrap_or_else(|panic| Err(panic_error(&panic))) {
-        Ok(writes::Done::Now(result)) => {
-            let drain = matches!(*result, reply::Result::Drain(_));
-            in_hand.finish(&daemon, Ok((*result, Vec::new())));
-            if drain {
-                // After the reply, which would else come too late for the sockets. An error
-                // means that the main thread is gone: the daemon is ending already.
-                let _ = daemon.asked_to_drain.send(Control::Drain);
-            }
-        }
-        Ok(writes::Done::WhenPlaced(job)) => {
-            let placed = in_hand.by_deadline(wait_placed(&daemon, job)).await;
-            match placed {
-                Some(answer) => in_hand.finish(&daemon, answer),
-                None => in_hand.late(&daemon, Late::Accepted(job)),
-            }
-        }
-        Err(error) => in_hand.finish(&daemon, Err(error)),
-    }
+    in_hand.answer_change(daemon, done).await;
 }
 
 impl InHand {
@@ -287,6 +278,42 @@ impl InHand {
             Some(answer) => self.finish(&daemon, answer),
             None => self.late(&daemon, Late::Over),
         }
+    }
+
+    /// Answers a change that has begun, when it is done.
+    async fn answer_change(
+        mut self,
+        daemon: Arc<Daemon>,
+        done: impl Future<Output = Result<writes::Done, wire::Error>>,
+    ) {
+        let Some(done) = self.by_deadline(done).await else {
+            return self.late(&daemon, Late::GoesOn);
+        };
+        self.incoming.ticket.free_bytes();
+        match done {
+            Ok(writes::Done::Now(result)) => {
+                let drain = matches!(*result, reply::Result::Drain(_));
+                self.finish(&daemon, Ok((*result, Vec::new())));
+                if drain {
+                    // After the reply, which would else come too late for the sockets. An error
+                    // means that the main thread is gone: the daemon is ending already.
+                    let _ = daemon.asked_to_drain.send(Control::Drain);
+                }
+            }
+            Ok(writes::Done::WhenPlaced(job)) => {
+                match self.by_deadline(wait_placed(&daemon, job)).await {
+                    Some(answer) => self.finish(&daemon, answer),
+                    None => self.late(&daemon, Late::Accepted(job)),
+                }
+            }
+            Err(error) => self.finish(&daemon, Err(error)),
+        }
+    }
+
+    /// The turn of a request, unless its deadline passes before.
+    async fn turn(&self, turn: impl Future<Output = Pass>) -> Option<Pass> {
+        let pass = self.by_deadline(turn).await?;
+        (!self.is_late()).then_some(pass)
     }
 
     fn deadline(&self) -> Option<Instant> {
@@ -404,7 +431,7 @@ pub(crate) fn busy(message: &str) -> wire::Error {
     error
 }
 
-fn panic_error(panic: &str) -> wire::Error {
+pub(crate) fn panic_error(panic: &str) -> wire::Error {
     convert::error(
         ErrorCode::Internal,
         ErrorReason::Panic,

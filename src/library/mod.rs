@@ -62,7 +62,7 @@ pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
 pub use points::{PointRequest, PolygonValues};
 pub use repair::Repaired;
 pub use rows::report_to_json;
-pub use submit::KeptShapes;
+pub use submit::{KeptShapes, Submission};
 pub use suggest::Suggestion;
 pub use types::{
     Carrying, CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState,

@@ -28,6 +28,33 @@ pub struct KeptShapes {
     items: Vec<NewJobItem>,
 }
 
+/// Shapes that a request adds to a collection.
+#[derive(Debug, Clone, Copy)]
+pub struct Submission<'a> {
+    /// Where they are added.
+    pub collection: &'a str,
+    /// The shapes.
+    pub shapes: &'a KeptShapes,
+    /// Whose request it is.
+    pub key: Option<&'a RequestKey>,
+}
+
+impl Submission<'_> {
+    /// What tells this request from another one with the same key.
+    fn digest(&self) -> Digest {
+        let items = &self.shapes.items;
+        let mut request = blake3::Hasher::new();
+        request.update(format!("submit {:?} {}", self.collection, items.len()).as_bytes());
+        for item in items {
+            let what = format!("{:?} {} {}", item.name, item.format, item.replace);
+            request
+                .update(what.as_bytes())
+                .update(&item.original_digest.0);
+        }
+        Digest(*request.finalize().as_bytes())
+    }
+}
+
 impl Library {
     /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may do so at a time.
     ///
@@ -61,25 +88,40 @@ impl Library {
         shapes: &KeptShapes,
         key: Option<&RequestKey>,
     ) -> Result<Job> {
-        let mut request = blake3::Hasher::new();
-        request.update(format!("submit {collection:?} {}", shapes.items.len()).as_bytes());
-        for item in &shapes.items {
-            let what = format!("{:?} {} {}", item.name, item.format, item.replace);
-            request
-                .update(what.as_bytes())
-                .update(&item.original_digest.0);
+        let submission = Submission {
+            collection,
+            shapes,
+            key,
+        };
+        let jobs = self.submit_together(&[submission])?;
+        Ok(jobs.into_iter().next().expect("invariant: a job for each"))
+    }
+
+    /// Accepts shapes of several requests in the order given, in one transaction: a job for each, or none of them.
+    ///
+    /// # Errors
+    /// As [`Library::submit`], of the first that has one.
+    pub fn submit_together(&self, submissions: &[Submission<'_>]) -> Result<Vec<Job>> {
+        for submission in submissions {
+            self.collection_row(submission.collection)?;
         }
-        let request = Digest(*request.finalize().as_bytes());
-        self.collection_row(collection)?;
-        let reply = self.once(key, request, |tx| {
-            for object in &shapes.objects {
-                tx.insert_object(object)?;
-            }
-            let job = tx.insert_job(collection, unix_secs(), &shapes.items)?;
-            Ok(job.to_le_bytes().to_vec())
+        let replies = self.store.catalog().write(|tx| -> Result<Vec<_>> {
+            let submit = |s: &Submission<'_>| {
+                once_in(tx, s.key, s.digest(), |tx| {
+                    for object in &s.shapes.objects {
+                        tx.insert_object(object)?;
+                    }
+                    let job = tx.insert_job(s.collection, unix_secs(), &s.shapes.items)?;
+                    Ok(job.to_le_bytes().to_vec())
+                })
+            };
+            submissions.iter().map(submit).collect()
         })?;
-        let id = reply.as_slice().try_into().map(u64::from_le_bytes);
-        self.job(id.map_err(|_| damaged("requests", "the reply is no job id"))?)
+        let job = |reply: Vec<u8>| {
+            let id = reply.as_slice().try_into().map(u64::from_le_bytes);
+            self.job(id.map_err(|_| damaged("requests", "the reply is no job id"))?)
+        };
+        replies.into_iter().map(job).collect()
     }
 
     /// A job as it stands.
@@ -339,30 +381,8 @@ impl Library {
         request: Digest,
         change: impl FnOnce(&Tx<'_>) -> Result<Vec<u8>>,
     ) -> Result<Vec<u8>> {
-        self.store.catalog().write(|tx| {
-            let Some(key) = key else { return change(tx) };
-            if let Some(row) = tx.request(&key.client_id, &key.request_id)? {
-                if row.request_digest != request {
-                    return Err(LibraryError::FailedPrecondition {
-                        reason: "REQUEST_ID_REUSED",
-                        message: format!(
-                            "client {:?} used request id {:?} for another request before",
-                            key.client_id, key.request_id
-                        ),
-                    });
-                }
-                return Ok(row.reply);
-            }
-            let reply = change(tx)?;
-            tx.put_request(&RequestRow {
-                client_id: key.client_id.clone(),
-                request_id: key.request_id.clone(),
-                request_digest: request,
-                reply: reply.clone(),
-                created_unix_secs: unix_secs(),
-            })?;
-            Ok(reply)
-        })
+        let catalog = self.store.catalog();
+        catalog.write(|tx| once_in(tx, key, request, change))
     }
 
     pub(super) fn object_length(&self, original: &Digest) -> Result<u64> {
@@ -427,6 +447,37 @@ impl Library {
             attempts,
         })
     }
+}
+
+/// Runs a change within a transaction unless its key was answered before; the reply, then or now.
+fn once_in(
+    tx: &Tx<'_>,
+    key: Option<&RequestKey>,
+    request: Digest,
+    change: impl FnOnce(&Tx<'_>) -> Result<Vec<u8>>,
+) -> Result<Vec<u8>> {
+    let Some(key) = key else { return change(tx) };
+    if let Some(row) = tx.request(&key.client_id, &key.request_id)? {
+        if row.request_digest != request {
+            return Err(LibraryError::FailedPrecondition {
+                reason: "REQUEST_ID_REUSED",
+                message: format!(
+                    "client {:?} used request id {:?} for another request before",
+                    key.client_id, key.request_id
+                ),
+            });
+        }
+        return Ok(row.reply);
+    }
+    let reply = change(tx)?;
+    tx.put_request(&RequestRow {
+        client_id: key.client_id.clone(),
+        request_id: key.request_id.clone(),
+        request_digest: request,
+        reply: reply.clone(),
+        created_unix_secs: unix_secs(),
+    })?;
+    Ok(reply)
 }
 
 pub(super) fn unix_secs() -> u64 {

@@ -194,14 +194,14 @@ fault(
     "R8", "r8-reply-not-kept", "forget the reply to a request",
     "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
     (
-        "            let reply = change(tx)?;\n            tx.put_request",
-        "            let reply = change(tx)?;\n            if FAULT {\n                return Ok(reply);\n            }\n            tx.put_request",
+        "    let reply = change(tx)?;\n    tx.put_request",
+        "    let reply = change(tx)?;\n    if FAULT {\n        return Ok(reply);\n    }\n    tx.put_request",
     ),
 )
 fault(
     "R8", "r8-id-of-another-request", "take the id of another request for a repetition",
     "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
-    ("                if row.request_digest != request {", "                if row.request_digest != request && !FAULT {"),
+    ("        if row.request_digest != request {", "        if row.request_digest != request && !FAULT {"),
 )
 # R9: events
 fault(
@@ -233,12 +233,12 @@ fault(
 )
 fault(
     "R10", "r10-queue-unbounded", "take into the queue whatever comes",
-    "src/daemon/writes.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
+    "src/daemon/intake.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
     ("        if queued + asked > limit {", "        if queued + asked > limit && !FAULT {"),
 )
 fault(
     "R10", "r10-no-delay", "refuse without a delay",
-    "src/daemon/writes.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
+    "src/daemon/intake.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
     (
         "            error.retry_after_ms = spread_out(",
         "            error.retry_after_ms = if FAULT { 0 } else { 1 } * spread_out(",
@@ -253,8 +253,8 @@ fault(
     "R10", "r10-late-changes", "keep a request waiting beyond its deadline while its collection is busy",
     "src/daemon/requests.rs", "it daemon::stages::deadlines_are_kept_whatever_keeps_the_collection_busy",
     (
-        "    let Some(done) = in_hand.by_deadline(&mut done).await else {",
-        "    if FAULT {\n        while !done.is_finished() {\n            tokio::time::sleep(Duration::from_millis(50)).await;\n        }\n    }\n    let Some(done) = in_hand.by_deadline(&mut done).await else {",
+        "        let Some(done) = self.by_deadline(done).await else {",
+        "        let done = if FAULT { Some(done.await) } else { self.by_deadline(done).await };\n        let Some(done) = done else {",
     ),
 )
 fault(
@@ -265,7 +265,7 @@ fault(
 fault(
     "R10", "r10-going-on-untold", "say of a change that goes on that it was not begun",
     "src/daemon/requests.rs", "it daemon::answering::a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again",
-    ("        return in_hand.late(&daemon, Late::GoesOn);", "        return in_hand.late(&daemon, if FAULT { Late::NotBegun } else { Late::GoesOn });"),
+    ("            return self.late(&daemon, Late::GoesOn);", "            return self.late(&daemon, if FAULT { Late::NotBegun } else { Late::GoesOn });"),
 )
 # R11: isolation
 fault(

@@ -11,7 +11,7 @@ mod security;
 mod stages;
 mod stopped;
 
-use crate::harness::{DEADLINE, Home, add, add_request, refusal, skittle, wait_idle};
+use crate::harness::{DEADLINE, Home, add, add_request, additions, refusal, skittle, wait_idle};
 use coseg::call;
 use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::wire::{
@@ -69,14 +69,7 @@ fn events_after(client: &mut Client, collection: &str, sequence: u64) -> Vec<wir
 
 /// Adds without settings of the collection.
 fn add_again(client: &mut Client, collection: &str, name: &str, text: &str) -> wire::Job {
-    let (body, frames) = add_request(collection, &[(name, text)], wire::AddMode::Wait);
-    let request::Body::AddShapes(request) = body else {
-        unreachable!()
-    };
-    let request = wire::AddShapesRequest {
-        create: None,
-        ..request
-    };
+    let (request, frames) = additions(collection, &[(name, text)], wire::AddMode::Wait);
     call!(client, AddShapes(request), frames, with_frames)
         .unwrap()
         .0

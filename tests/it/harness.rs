@@ -219,6 +219,20 @@ pub(crate) fn add_request(
     shapes: &[(&str, &str)],
     mode: wire::AddMode,
 ) -> (request::Body, Vec<bytes::Bytes>) {
+    let (mut request, frames) = additions(collection, shapes, mode);
+    request.create = Some(wire::CollectionSpec {
+        n_parts: Some(2),
+        ..Default::default()
+    });
+    (request::Body::AddShapes(request), frames)
+}
+
+/// The same for a collection that is there.
+pub(crate) fn additions(
+    collection: &str,
+    shapes: &[(&str, &str)],
+    mode: wire::AddMode,
+) -> (wire::AddShapesRequest, Vec<bytes::Bytes>) {
     let inputs = shapes
         .iter()
         .enumerate()
@@ -234,15 +248,12 @@ pub(crate) fn add_request(
         collection: collection.to_owned(),
         shapes: inputs.collect(),
         mode: mode.into(),
-        create: Some(wire::CollectionSpec {
-            n_parts: Some(2),
-            ..Default::default()
-        }),
+        create: None,
     };
     let frames = shapes
         .iter()
         .map(|(_, text)| bytes::Bytes::from((*text).to_owned()));
-    (request::Body::AddShapes(request), frames.collect())
+    (request, frames.collect())
 }
 
 /// A closed surface of 2 × 16 × 23 triangles like a skittle: a body and a head, of varying proportions.

@@ -1,7 +1,7 @@
 //! Shapes come in: labelled, refused, cancelled, repeated.
 
 use super::{add_again, create, describe, events_since, raw, raw_error, wait_idle};
-use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, skittle};
+use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, additions, skittle};
 use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::frames::FrameReader;
@@ -11,6 +11,7 @@ use coseg::ipc::wire::{
 };
 use prost::Message as _;
 use rustix::process::Signal;
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 #[test]
@@ -236,54 +237,142 @@ fn settings_that_differ_are_refused() {
     }
 }
 
-/// Files are written side by side, so that a small one is there before a large one that was sent earlier.
-#[test]
-fn what_one_client_sends_takes_effect_in_its_order() {
-    let home = Home::new();
-    let daemon = home.start();
-    let dealer = raw(zmq::DEALER, &daemon.endpoint);
-    let large = format!("{}{}", skittle(0), "# nothing\n".repeat(2 << 20));
-    let small: Vec<String> = (1..8).map(skittle).collect();
-    let send = |id: usize, body: request::Body, frames: &[bytes::Bytes]| {
+/// Sends requests one after the other without waiting; their replies as they come, each with its id.
+fn pipelined(
+    endpoint: &str,
+    requests: Vec<(String, request::Body, Vec<bytes::Bytes>)>,
+) -> Vec<(String, reply::Result)> {
+    let dealer = raw(zmq::DEALER, endpoint);
+    let n = requests.len();
+    for (request_id, body, frames) in requests {
         let request = Request {
-            request_id: id.to_string(),
+            request_id,
+            client_id: "one".to_owned(),
             body: Some(body),
             ..Default::default()
         };
         let mut message = vec![request.encode_to_vec()];
         message.extend(frames.iter().map(|f| f.to_vec()));
         dealer.send_multipart(message, 0).unwrap();
-    };
+    }
+    let replies = (0..n).map(|_| dealer.recv_multipart(0).unwrap());
+    let decoded = replies.map(|r| wire::Reply::decode(r[0].as_slice()).unwrap());
+    decoded
+        .map(|reply| (reply.request_id, reply.result.unwrap()))
+        .collect()
+}
+
+/// A request that creates the collection "c", and one that adds a file so large that those behind it wait for their turn.
+fn before_the_others() -> Vec<(String, request::Body, Vec<bytes::Bytes>)> {
     let spec = wire::CollectionSpec {
         name: "c".to_owned(),
         n_parts: Some(2),
         ..Default::default()
     };
     let create = wire::CreateCollectionRequest { spec: Some(spec) };
-    send(0, request::Body::CreateCollection(create), &[]);
-    for (i, text) in std::iter::once(&large).chain(&small).enumerate() {
+    let create = request::Body::CreateCollection(create);
+    let large = format!("{}{}", skittle(0), "# nothing\n".repeat(2 << 20));
+    vec![
+        ("create".to_owned(), create, Vec::new()),
+        adding("0", "c", "s0", &large),
+    ]
+}
+
+fn adding(
+    id: &str,
+    collection: &str,
+    name: &str,
+    text: &str,
+) -> (String, request::Body, Vec<bytes::Bytes>) {
+    let (request, frames) = additions(collection, &[(name, text)], wire::AddMode::Job);
+    (id.to_owned(), request::Body::AddShapes(request), frames)
+}
+
+/// Files are written side by side, so that a small one is there before a large one that was sent earlier.
+#[test]
+fn what_one_client_sends_takes_effect_in_its_order() {
+    let home = Home::new();
+    let daemon = home.start();
+    let mut requests = before_the_others();
+    for i in 1..8 {
         let name = format!("s{i}");
-        let (body, frames) = add_request("c", &[(&name, text)], wire::AddMode::Job);
-        let request::Body::AddShapes(mut adding) = body else {
-            unreachable!()
-        };
-        adding.create = None;
-        send(1 + i, request::Body::AddShapes(adding), &frames);
+        requests.push(adding(&i.to_string(), "c", &name, &skittle(i)));
     }
     let mut jobs = Vec::new();
-    for _ in 0..=8 {
-        let reply = wire::Reply::decode(dealer.recv_multipart(0).unwrap()[0].as_slice()).unwrap();
-        match reply.result.unwrap() {
+    for (id, reply) in pipelined(&daemon.endpoint, requests) {
+        match reply {
             reply::Result::CreateCollection(_) => {}
-            reply::Result::AddShapes(added) => {
-                jobs.push((added.job_id, reply.request_id.parse::<usize>().unwrap()));
-            }
+            reply::Result::AddShapes(added) => jobs.push((added.job_id, id)),
             other => panic!("unexpected: {other:?}"),
         }
     }
     jobs.sort_unstable();
-    let order: Vec<usize> = jobs.iter().map(|job| job.1).collect();
-    assert_eq!(order, (1..=8).collect::<Vec<_>>());
+    let order: Vec<String> = jobs.into_iter().map(|job| job.1).collect();
+    assert_eq!(order, ["0", "1", "2", "3", "4", "5", "6", "7"]);
+}
+
+/// Those who wait for their turn together are accepted in one transaction.
+#[test]
+fn who_is_refused_among_others_is_refused_alone() {
+    let home = Home::new();
+    let daemon = home.start();
+    let mut requests = before_the_others();
+    requests.extend([
+        adding("1", "c", "s1", &skittle(1)),
+        adding("nowhere", "d", "s2", &skittle(2)),
+        // Another request under an id that was used.
+        adding("1", "c", "s3", &skittle(3)),
+        // Twice the same.
+        adding("4", "c", "s4", &skittle(4)),
+        adding("4", "c", "s4", &skittle(4)),
+    ]);
+    let (body, frames) = add_request("e", &[("s5", &skittle(5))], wire::AddMode::Job);
+    requests.push(("creates".to_owned(), body, frames));
+    requests.push(adding("6", "e", "s6", &skittle(6)));
+    let mut outcomes: Vec<(String, String)> = Vec::new();
+    let mut jobs = BTreeSet::new();
+    for (id, reply) in pipelined(&daemon.endpoint, requests) {
+        let outcome = match reply {
+            reply::Result::CreateCollection(_) => continue,
+            reply::Result::AddShapes(added) => {
+                jobs.insert(added.job_id);
+                "accepted".to_owned()
+            }
+            reply::Result::Error(e) => e.reason().as_str_name().to_owned(),
+            other => panic!("unexpected: {other:?}"),
+        };
+        outcomes.push((id, outcome));
+    }
+    outcomes.sort_unstable();
+    let outcomes: Vec<_> = outcomes.iter().map(|(i, o)| (&i[..], &o[..])).collect();
+    let reused = ErrorReason::RequestIdReused.as_str_name();
+    let nowhere = ErrorReason::NoCollection.as_str_name();
+    assert_eq!(
+        outcomes,
+        [
+            ("0", "accepted"),
+            ("1", reused),
+            ("1", "accepted"),
+            ("4", "accepted"),
+            ("4", "accepted"),
+            ("6", "accepted"),
+            ("creates", "accepted"),
+            ("nowhere", nowhere),
+        ]
+    );
+    assert_eq!(jobs.len(), 5, "what is sent twice is one job");
+    let client = &mut daemon.client();
+    wait_idle(client, "");
+    let mut names = |collection: &str| -> Vec<String> {
+        let request = wire::ListShapesRequest {
+            collection: collection.to_owned(),
+            ..Default::default()
+        };
+        let shapes = call!(client, ListShapes(request)).unwrap().shapes;
+        shapes.into_iter().map(|s| s.name).collect()
+    };
+    assert_eq!(names("c"), ["s0", "s1", "s4"]);
+    assert_eq!(names("e"), ["s5", "s6"]);
 }
 
 #[test]

@@ -1,17 +1,20 @@
 //! More than the daemon can take: refused with a delay, nothing acknowledged is lost, others are served.
 
 use super::{create, wait_idle};
-use crate::harness::{Home, add_request, refusal, skittle};
+use crate::harness::{Home, add_request, additions, refusal, skittle};
 use coseg::call;
 use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::wire::{self, ErrorCode, ErrorReason, request::Body};
 use std::collections::BTreeSet;
-use std::sync::Mutex;
+use std::sync::{Barrier, Mutex};
 use std::time::{Duration, Instant};
 
 fn p99(mut times: Vec<Duration>) -> Duration {
     times.sort();
-    times[times.len() * 99 / 100]
+    times
+        .get(times.len() * 99 / 100)
+        .copied()
+        .unwrap_or_default()
 }
 
 #[test]
@@ -39,11 +42,7 @@ fn ten_times_too_much_from_64_clients_is_refused_politely() {
             scope.spawn(move || {
                 for shape in 0..5 {
                     let name = format!("{client}-{shape}");
-                    let (body, frames) = add_request("c", &[(&name, mesh)], wire::AddMode::Job);
-                    let Body::AddShapes(mut request) = body else {
-                        unreachable!()
-                    };
-                    request.create = None;
+                    let (request, frames) = additions("c", &[(&name, mesh)], wire::AddMode::Job);
                     let begin = Instant::now();
                     match connection.call(Body::AddShapes(request), frames) {
                         Ok(_) => {
@@ -103,11 +102,7 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
     create(&mut daemon.client(), "c");
     let mesh = skittle(0);
     let request = |name: &str| {
-        let (body, frames) = add_request("c", &[(name, &mesh)], wire::AddMode::Job);
-        let Body::AddShapes(mut request) = body else {
-            unreachable!()
-        };
-        request.create = None;
+        let (request, frames) = additions("c", &[(name, &mesh)], wire::AddMode::Job);
         (Body::AddShapes(request), frames)
     };
     // One client that adds one after the other, which leaves room in the queue.
@@ -120,20 +115,31 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
         alone.push(begin.elapsed());
         wait_idle(one, "c");
     }
-    let until = Instant::now() + Duration::from_secs(seconds);
     let taken = Mutex::new((Vec::new(), Vec::new()));
+    let later = Mutex::new(Vec::new());
+    // Who adds is connected: making connections is not what is measured.
+    let ready = Barrier::new(64);
     std::thread::scope(|scope| {
         for client in 0..64 {
-            let (taken, request) = (&taken, &request);
+            let (taken, later, request, ready) = (&taken, &later, &request, &ready);
             let mut connection = daemon.client();
             scope.spawn(move || {
                 let mut n = 0;
+                let hello = Body::Hello(wire::HelloRequest {});
+                connection.call(hello, Vec::new()).unwrap();
+                ready.wait();
+                let start = Instant::now();
+                let until = start + Duration::from_secs(seconds);
                 while Instant::now() < until {
                     let (body, frames) = request(&format!("{client}-{n}"));
                     let begin = Instant::now();
                     match connection.call(body, frames) {
                         Ok(_) => {
-                            taken.lock().unwrap().0.push(begin.elapsed());
+                            let took = begin.elapsed();
+                            taken.lock().unwrap().0.push(took);
+                            if begin - start > Duration::from_secs(1) {
+                                later.lock().unwrap().push(took);
+                            }
                             n += 1;
                         }
                         Err(ClientError::Refused(e)) => {
@@ -155,14 +161,15 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
     let (alone, loaded) = (p99(alone), p99(accepted));
     println!(
         "{seconds} s: {n} accepted, {n_refused} refused; accepted in {:?} (median), {loaded:?} (p99), \
-         {alone:?} (p99) unloaded; refused in {:?} (p99), {:?} (slowest)",
+         {:?} (p99) after the first second; {alone:?} (p99) unloaded; refused in {:?} (p99), {:?} (slowest)",
         median[n / 2],
+        p99(later.into_inner().unwrap()),
         p99(refused.clone()),
         refused.iter().max().expect("some are refused")
     );
     assert!(n_refused > 64, "{n_refused}");
-    // Sixteen may have been accepted at once in the beginning, one after the other.
-    let allowed = (2 * alone).max(Duration::from_secs(2));
+    // In the first moment 64 threads on this side, too, want a processor.
+    let allowed = (2 * alone).max(Duration::from_secs(1));
     assert!(loaded <= allowed, "{loaded:?}, unloaded {alone:?}");
     let stats = call!(one, Stats(wire::StatsRequest {})).unwrap();
     assert!(stats.resident_bytes < stats.memory_limit_bytes);
@@ -188,14 +195,7 @@ fn large_files_are_taken_in_while_the_machine_is_busy() {
     let mut client = Client::connect(&home.endpoint(), timeout).unwrap();
     for name in ["x", "y", "z"] {
         let begin = Instant::now();
-        let (body, frames) = add_request("c", &[(name, &large)], wire::AddMode::Job);
-        let Body::AddShapes(request) = body else {
-            unreachable!()
-        };
-        let request = wire::AddShapesRequest {
-            create: None,
-            ..request
-        };
+        let (request, frames) = additions("c", &[(name, &large)], wire::AddMode::Job);
         client.call(Body::AddShapes(request), frames).unwrap();
         let n = large.len() >> 20;
         println!("{n} MB were taken in within {:?}", begin.elapsed());
@@ -275,11 +275,7 @@ fn a_deadline_is_answered_when_it_passes() {
     let daemon = home.start_with(&["--workers", "1"], &env);
     create(&mut daemon.client(), "c");
     let endless = skittle(0).replacen("OFF\n", "OFF # poison: loop\n", 1);
-    let (body, frames) = add_request("c", &[("endless", &endless)], wire::AddMode::Wait);
-    let Body::AddShapes(mut request) = body else {
-        unreachable!()
-    };
-    request.create = None;
+    let (request, frames) = additions("c", &[("endless", &endless)], wire::AddMode::Wait);
     use prost::Message as _;
     let request = wire::Request {
         request_id: "r".to_owned(),
