@@ -1,6 +1,7 @@
 //! Random operations and restarts, against a model in memory: what the store answers is what the model holds.
 //!
-//! `COSEG_TEST_OPERATIONS` and `COSEG_TEST_SEED` make it longer and other; the seed is printed.
+//! `COSEG_TEST_OPERATIONS`, of each of `COSEG_TEST_ROUNDS` libraries, and `COSEG_TEST_SEED`, which counts on from library to
+//! library, make it longer and other; the seed is printed.
 
 use super::{add_shape, description, label_version, summary};
 use crate::harness::{number, seed};
@@ -90,7 +91,14 @@ fn compare(store: &Store, model: &Model, whole: bool, context: &str) {
 #[test]
 fn random_operations_agree_with_a_model_across_restarts() {
     let n_operations = number("COSEG_TEST_OPERATIONS", 3_000);
-    let seed = seed();
+    let first = seed();
+    for seed in first..first + number("COSEG_TEST_ROUNDS", 1) {
+        agree(n_operations, seed);
+    }
+}
+
+/// One library, from nothing.
+fn agree(n_operations: u64, seed: u64) {
     println!("{n_operations} operations, COSEG_TEST_SEED={seed}");
     let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
     let dir = tempfile::tempdir().expect("a folder");
