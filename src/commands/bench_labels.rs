@@ -443,7 +443,7 @@ fn without_maps(views: &[DescriptionView<'_>], k: usize, up: Option<[f64; 3]>) -
                     ..DiscoveryOptions::default()
                 },
                 up,
-                always: model.is_none(),
+                min_gain: coseg::library::min_gain(n + 1),
                 next_label: used,
             };
             let outcome = recluster(&shapes, model.as_ref(), n as u64 + 1, &options);

@@ -106,7 +106,7 @@ impl Library {
             lane.shapes.iter_mut().for_each(|s| s.stale = true);
         }
         lane.shapes
-            .push(KnownShape::fresh(id, commit.shape.ordinal, signature));
+            .push(KnownShape::fresh(id, &commit.shape, signature));
         if let (true, Some(new)) = (commit.plan.teach_again, lane.shapes.last_mut()) {
             new.stale = true;
         }

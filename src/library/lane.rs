@@ -4,13 +4,15 @@ use super::learnt::Learnt;
 use super::rows::{CollectionState, damaged};
 use super::{Result, Up};
 use crate::neighbors::SignatureMetric;
-use crate::store::{CollectionRow, Reader, ShapeId};
+use crate::store::{CollectionRow, Digest, Reader, ShapeId};
 
 /// A stored shape, as far as placing others needs it without opening its file.
 #[derive(Debug, Clone)]
 pub(super) struct KnownShape {
     pub(super) id: ShapeId,
     pub(super) ordinal: u64,
+    /// Of the original bytes.
+    pub(super) digest: Digest,
     pub(super) stale: bool,
     /// Whether a person labelled faces of it.
     pub(super) pinned: bool,
@@ -49,6 +51,7 @@ impl Lane {
             shapes.push(KnownShape {
                 id: s.id,
                 ordinal: s.ordinal,
+                digest: s.content_digest,
                 stale: s.stale,
                 pinned: pinned.binary_search(&s.id).is_ok(),
                 signature,
@@ -103,12 +106,12 @@ impl Lane {
         found.map(|(i, distance)| (among[i], distance)).collect()
     }
 
-    /// Shapes to be clustered together, at most `limit`, spread evenly over the order of arrival.
+    /// Shapes to be clustered together, at most `limit`: those of the least digests, which are a random choice that does not
+    /// depend on the order of arrival and changes little as the collection grows; by their digests.
     pub(super) fn representatives(&self, limit: usize) -> Vec<usize> {
-        let n = self.shapes.len();
-        if n <= limit {
-            return (0..n).collect();
-        }
-        (0..limit).map(|i| i * n / limit).collect()
+        let mut all: Vec<usize> = (0..self.shapes.len()).collect();
+        all.sort_by_key(|&at| (self.shapes[at].digest, self.shapes[at].ordinal));
+        all.truncate(limit);
+        all
     }
 }

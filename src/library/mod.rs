@@ -58,7 +58,7 @@ pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
 pub use jobs::JobFilter;
-pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, next_recluster};
+pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use points::{PointRequest, PolygonValues};
 pub use repair::Repaired;
 pub use rows::report_to_json;

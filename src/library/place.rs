@@ -13,7 +13,8 @@ use crate::pipeline::{
     label, map, recluster, unlikeness,
 };
 use crate::store::{
-    JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId, ShapeRow,
+    Digest, JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId,
+    ShapeRow,
 };
 use std::time::Instant;
 
@@ -24,6 +25,10 @@ pub const MAX_MAPS: usize = 5;
 pub const MAX_REPRESENTATIVES: usize = 40;
 /// Shapes below which a collection is too small to judge a labelling: the new one is always taken.
 const TOO_FEW: usize = 5;
+/// By how much more a new labelling must be worth once only a sample of the shapes is clustered: a quarter of a nat, as if
+/// boundaries were a quarter more concave. It knows no more than the one that is there, which was found on as many shapes, and
+/// the best of hundreds of candidates on another sample always seems a little better.
+const SAMPLE_GAIN: f64 = 0.25;
 /// Growth of a collection from one re-clustering to the next.
 const RECLUSTER_GROWTH: f64 = 1.4;
 
@@ -109,7 +114,9 @@ impl Library {
                 taught.plan
             }
             (None, Some(labelling), Some(learnt)) if !due => grown(lane, learnt, labelling, &view),
-            (None, labelling, _) => self.reclustered(lane, &view, labelling)?,
+            (None, labelling, _) => {
+                self.reclustered(lane, (&view, accepted.item.original_digest), labelling)?
+            }
         };
         lap("recluster");
         n_relabelled += plan.relabelled.len() as u32;
@@ -213,10 +220,12 @@ impl Library {
     fn reclustered(
         &self,
         lane: &mut Lane,
-        view: &DescriptionView<'_>,
+        (view, digest): (&DescriptionView<'_>, Digest),
         labelling: Option<Labelling>,
     ) -> Result<Plan> {
         let chosen = lane.representatives(MAX_REPRESENTATIVES);
+        // The new shape, too, has its place by its digest.
+        let new_at = chosen.partition_point(|at| lane.shapes[*at].digest <= digest);
         for &at in &chosen {
             self.relabel(lane, at)?;
         }
@@ -246,10 +255,11 @@ impl Library {
                 labels,
             })
             .collect();
-        shapes.push(Representative {
+        let new = Representative {
             shape: *view,
             labels: &new_ids,
-        });
+        };
+        shapes.insert(new_at, new);
         let n_labels = lane.row.n_parts.map(|n| n as usize);
         let (up_state, up) = UpState::of(lane.up(), shapes.iter().map(|s| &s.shape));
         let options = ReclusterOptions {
@@ -258,7 +268,7 @@ impl Library {
                 ..DiscoveryOptions::default()
             },
             up,
-            always: shapes.len() <= TOO_FEW,
+            min_gain: min_gain(lane.shapes.len() + 1),
             next_label: lane.row.next_label,
         };
         let epoch = old.map_or(0, |m| m.epoch) + 1;
@@ -276,9 +286,7 @@ impl Library {
             return Ok(plan);
         }
         let mut labellings = outcome.labellings;
-        let Some(labelling) = labellings.pop() else {
-            unreachable!("the new shape is the last representative")
-        };
+        let labelling = labellings.remove(new_at);
         let ordinals = chosen
             .iter()
             .map(|at| lane.shapes[*at].ordinal)
@@ -317,6 +325,17 @@ impl Library {
             learnt.model.statistics.accumulate(&statistics, -1.0);
         }
         Ok(lane.shapes.remove(at).pinned)
+    }
+}
+
+/// By how much more than the labelling that is there a new one must be worth in a collection of so many shapes. Nothing while
+/// all of them are clustered, each time with many that were not there before: a margin would keep what was found when there
+/// was less to go by.
+pub fn min_gain(n_shapes: usize) -> f64 {
+    match n_shapes {
+        0..=TOO_FEW => f64::NEG_INFINITY,
+        n if n <= MAX_REPRESENTATIVES + 1 => 0.0,
+        _ => SAMPLE_GAIN,
     }
 }
 
@@ -407,10 +426,11 @@ pub(super) fn classes_of(ids: &[i32], labels: &[u32]) -> Vec<u32> {
 
 impl KnownShape {
     /// The shape as it is when it has just been labelled.
-    pub(super) fn fresh(id: ShapeId, ordinal: u64, signature: Vec<f32>) -> Self {
+    pub(super) fn fresh(id: ShapeId, row: &NewShapeRow, signature: Vec<f32>) -> Self {
         Self {
             id,
-            ordinal,
+            ordinal: row.ordinal,
+            digest: row.content_digest,
             stale: false,
             pinned: false,
             signature,

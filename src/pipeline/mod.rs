@@ -19,6 +19,6 @@ pub use place::{
     Labelling, Prepared, Vote, carried, label, map, map_by_descriptors, map_from, unlikeness,
 };
 pub use recluster::{
-    LabelChange, MIN_GAIN, ReclusterOptions, Reclustering, Representative, batch, recluster,
+    LabelChange, ReclusterOptions, Reclustering, Representative, batch, recluster,
 };
 pub use split::{split_faces, split_model};

@@ -9,11 +9,6 @@ use crate::labels::{
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
 
-/// A new labelling is taken only if its value is higher by this. Nothing: the labelling that is there competes with
-/// the new ones by the same measure on the same shapes, and each re-clustering sees many more shapes than the one
-/// before, so that a margin keeps what was found when there was less to go by.
-pub const MIN_GAIN: f64 = 0.0;
-
 /// A representative shape and the labels its faces carry now.
 #[derive(Debug, Clone, Copy)]
 pub struct Representative<'a> {
@@ -30,8 +25,8 @@ pub struct ReclusterOptions {
     pub discovery: DiscoveryOptions,
     /// The up axis, if known.
     pub up: Option<[f64; 3]>,
-    /// Take the new labelling whatever its score: while a collection is too small to judge.
-    pub always: bool,
+    /// A new labelling is taken only if its value is higher by more than this; negative infinity takes it whatever its value.
+    pub min_gain: f64,
     /// First label id that was never used.
     pub next_label: u32,
 }
@@ -92,7 +87,7 @@ pub fn recluster(
     let there = current.as_deref().zip(old.map(|m| m.labels.len()));
     let found = discover(&input, &options.discovery, there);
     let (old_score, new_score) = (found.current_value, found.value);
-    let accepted = options.always || new_score > old_score + MIN_GAIN;
+    let accepted = new_score > old_score + options.min_gain;
     let (labels, classes, changes) = match (accepted, current, old) {
         (false, Some(classes), Some(model)) => (model.labels.clone(), classes, Vec::new()),
         (_, current, old) => rename(

@@ -95,6 +95,35 @@ fn a_stream_of_pliers_is_labelled_consistently() {
     assert_eq!(score.n_missing, 0);
 }
 
+/// As long as every clustering is taken, what is found follows from the shapes alone.
+#[test]
+fn the_order_of_arrival_makes_no_difference_to_what_is_found() {
+    let shapes = family(Family::Pliers, 5, 5, &SMALL);
+    let parts = |shapes: &[Labelled]| {
+        let (_folder, library) = library(3, Up::Unknown);
+        stream(&library, shapes);
+        // Label ids go by the history: numbered as they first occur, they do not.
+        let mut numbers = BTreeMap::new();
+        let mut numbered = |label: &i32| {
+            let next = numbers.len();
+            *numbers.entry(*label).or_insert(next)
+        };
+        let mut parts = Vec::new();
+        for (name, labels) in all_labels(&library) {
+            let of_shape: Vec<usize> = labels.iter().map(&mut numbered).collect();
+            parts.push((name, of_shape));
+        }
+        parts
+    };
+    let found = parts(&shapes);
+    for shift in 1..shapes.len() {
+        let mut others = shapes.clone();
+        others.rotate_left(shift);
+        others.swap(0, 1);
+        assert!(parts(&others) == found, "rotated by {shift}");
+    }
+}
+
 #[test]
 fn the_same_stream_gives_the_same_labels_and_the_same_log() {
     let shapes = family(Family::Container, 3, 6, &SMALL);
