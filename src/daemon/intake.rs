@@ -233,7 +233,7 @@ fn check(daemon: &Arc<Daemon>, addition: &Addition) -> Result<(), wire::Error> {
 fn submit(daemon: &Daemon, submissions: &[Submission<'_>]) -> Vec<Result<Job, LibraryError>> {
     let library = &daemon.library;
     match library.submit_together(submissions) {
-        Ok(jobs) => jobs.into_iter().map(Ok).collect(),
+        Ok(jobs) => jobs,
         Err(e) if submissions.len() == 1 => vec![Err(e)],
         Err(_) => {
             let alone = |s: &Submission<'_>| library.submit(s.collection, s.shapes, s.key);

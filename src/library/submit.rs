@@ -94,14 +94,15 @@ impl Library {
             key,
         };
         let jobs = self.submit_together(&[submission])?;
-        Ok(jobs.into_iter().next().expect("invariant: a job for each"))
+        jobs.into_iter().next().expect("invariant: a job for each")
     }
 
-    /// Accepts shapes of several requests in the order given, in one transaction: a job for each, or none of them.
+    /// Accepts shapes of several requests in the order given, in one transaction: a job for each, which is durable even if
+    /// it cannot be read back, or none of them.
     ///
     /// # Errors
-    /// As [`Library::submit`], of the first that has one.
-    pub fn submit_together(&self, submissions: &[Submission<'_>]) -> Result<Vec<Job>> {
+    /// As [`Library::submit`], of the first that has one; then nothing is accepted.
+    pub fn submit_together(&self, submissions: &[Submission<'_>]) -> Result<Vec<Result<Job>>> {
         for submission in submissions {
             self.collection_row(submission.collection)?;
         }
@@ -121,7 +122,7 @@ impl Library {
             let id = reply.as_slice().try_into().map(u64::from_le_bytes);
             self.job(id.map_err(|_| damaged("requests", "the reply is no job id"))?)
         };
-        replies.into_iter().map(job).collect()
+        Ok(replies.into_iter().map(job).collect())
     }
 
     /// A job as it stands.
