@@ -336,7 +336,14 @@ fn target<'a>(
         };
         let view = prep.shapes[t].description.view();
         let given = if arm == 2 { &[][..] } else { &given[..] };
-        let found = label_taught(&view, &prep.prepared[t], &statistics, given, &[], &options);
+        let found = label_taught(
+            &view,
+            &prep.prepared[t],
+            (&statistics, None),
+            given,
+            &[],
+            &options,
+        );
         prep.shapes[t].accuracy(&found.classes)
     };
     let five = |order: &[usize]| order[..N_BEST.min(order.len())].to_vec();

@@ -48,6 +48,13 @@ pub struct Confidence {
 }
 
 impl Confidence {
+    /// The same at each of `n` vertices.
+    pub fn everywhere(probability: f64, n: usize) -> Self {
+        Self {
+            of_vertex: vec![1 + (STEPS * probability).round() as u8; n],
+        }
+    }
+
     /// From the squared descriptor differences `residuals (n2,)` and `returns (n2,)` of a map to the shape with these faces.
     pub fn new(quality: &Quality, faces: &[[u32; 3]], residuals: &[f32], returns: &[f32]) -> Self {
         let of_map = figures(quality);

@@ -1,8 +1,8 @@
 //! The labels of a collection: discovered, carried, and kept.
 //!
 //! [`discover`] finds parts that recur over a few shapes while nothing is labelled. [`LabelModel`] is what a
-//! collection has learnt of its labels. [`cut`] turns per-face evidence into a labelling with short
-//! boundaries along concave creases.
+//! collection has learnt of its labels, [`PriorLabels`] what it had discovered before a person labelled anything.
+//! [`cut`] turns per-face evidence into a labelling with short boundaries along concave creases.
 
 mod baselines;
 mod boundary;
@@ -15,6 +15,7 @@ mod joint;
 mod judge;
 mod model;
 mod patchwise;
+mod prior;
 pub mod score;
 #[cfg(test)]
 mod test_shapes;
@@ -25,4 +26,5 @@ pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
+pub use prior::{Pinned, PriorLabels};
 pub use up::{UpVote, estimate_up};

@@ -6,8 +6,6 @@ use nalgebra::{Cholesky, DMatrix};
 
 /// Share of the mean variance mixed into the pooled covariance.
 const SHRINKAGE: f64 = 0.02;
-/// Share of a shape's area that is added to what is seen of the meaning of a label, spread over all classes.
-const UNSEEN_AREA: f64 = 0.05;
 
 /// Counts, sums and second moments of labelled faces, each weighted by its share of its shape's area.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,37 +91,9 @@ impl Statistics {
         mixed
     }
 
-    /// What these labels mean in the words of somebody who `labelled` faces (features, area, class of each face or none):
-    /// for each a probability of each of `n` classes `(k, n)`, row-major, by the area that the classifier of these labels
-    /// gives to the label and the person to the class.
-    pub fn meaning<'a>(
-        &self,
-        labelled: impl Iterator<Item = (&'a Features, &'a [f64], &'a [Option<u32>])>,
-        n: usize,
-    ) -> Vec<f64> {
-        let k = self.counts.len();
-        let classifier = self.classifier();
-        let mut meaning = vec![UNSEEN_AREA / n as f64; k * n];
-        for (features, area, classes) in labelled {
-            let log = classifier.log_probabilities(features);
-            let faces = log.chunks_exact(k).zip(area).zip(classes);
-            for ((row, area), class) in faces {
-                let Some(class) = class else { continue };
-                for (label, log) in row.iter().enumerate() {
-                    meaning[label * n + *class as usize] += log.exp() * area;
-                }
-            }
-        }
-        for row in meaning.chunks_exact_mut(n) {
-            let sum: f64 = row.iter().sum();
-            row.iter_mut().for_each(|p| *p /= sum);
-        }
-        meaning
-    }
-
     /// Statistics of other labels, of which each of these stands for some with the probabilities `meaning` `(k, n)`,
     /// row-major, whose rows sum to one.
-    pub fn translated(&self, meaning: &[f64], n: usize) -> Self {
+    pub(super) fn translated(&self, meaning: &[f64], n: usize) -> Self {
         let dim = self.sums.len() / self.counts.len().max(1);
         let mut out = Self {
             moment: self.moment.clone(),
@@ -289,23 +259,6 @@ mod tests {
         assert_eq!((&mixed.counts, &mixed.sums), (&one.counts, &one.sums));
         let expected = one.scatter_within() * 0.75 + other * 0.25;
         assert!((mixed.scatter_within() - expected).norm() < 1e-12);
-    }
-
-    #[test]
-    fn labels_mean_what_a_person_calls_their_faces() {
-        let (x, a, y) = blobs(1);
-        let found = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3);
-        let (x2, a2, y2) = blobs(2);
-        // The person calls the first two 1, the third 0, and has not looked at half of the faces.
-        let called = |(f, y): (usize, &u32)| (f < 300).then_some(u32::from(*y < 2));
-        let person: Vec<Option<u32>> = y2.iter().enumerate().map(called).collect();
-        let meaning = found.meaning([(&x2, &a2[..], &person[..])].into_iter(), 2);
-        for (row, class) in meaning.chunks(2).zip([1, 1, 0]) {
-            assert!((row[0] + row[1] - 1.0).abs() < 1e-12);
-            assert!(row[class] > 0.8, "{meaning:?}");
-        }
-        let nothing = found.meaning(std::iter::empty(), 2);
-        assert_eq!(nothing, [0.5; 6]);
     }
 
     #[test]

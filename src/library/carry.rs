@@ -4,6 +4,7 @@
 use super::commit::{collection_row, map_row, put_relabelled};
 use super::correct::pin_polygons;
 use super::lane::Lane;
+use super::learnt::Learnt;
 use super::place::{Known, MAX_MAPS, Plan, next_recluster, sources_of};
 use super::relabel::{Relabelled, area_shares, cause};
 use super::rows::{Teaching, confidence_of_row};
@@ -63,7 +64,7 @@ impl Library {
             .map(|v| new_map(&v.known, (view, &prepared), model))
             .collect();
         let kept: Vec<MapIn> = maps.iter().map(MapIn::new).collect();
-        let labelling = vote((view, &prepared), model, &voters, &kept, &[]);
+        let labelling = vote((view, &prepared), learnt, &voters, &kept, &[]);
         let known: Vec<Known> = voters.into_iter().map(|v| v.known).collect();
         let sources = sources_of(&known, &labelling.weights);
         let n_shapes = lane.shapes.len() as u64 + 1;
@@ -143,7 +144,7 @@ impl Library {
         let into = self.maps_into(&voters, (id, &view, &prepared), model)?;
         let pinned = pinned_classes(&view, &pins, &model.labels);
         let kept: Vec<MapIn> = into.iter().map(|(m, _)| m.clone()).collect();
-        let labelling = vote((&view, &prepared), model, &voters, &kept, &pinned);
+        let labelling = vote((&view, &prepared), learnt, &voters, &kept, &pinned);
         let epoch = model.epoch;
         let mut relabelled = self.carried(&known, &labelling, &model.labels, &pins)?;
         let from: Vec<ShapeId> = voters.iter().map(|v| v.known.row.id).collect();
@@ -320,7 +321,7 @@ pub(super) fn new_map(
 /// Labels a shape by the votes of others and what was learnt.
 fn vote(
     (view, prepared): (&DescriptionView<'_>, &Prepared),
-    model: &LabelModel,
+    learnt: &Learnt,
     voters: &[Voter],
     maps: &[MapIn],
     pinned: &[Option<u32>],
@@ -339,5 +340,6 @@ fn vote(
         })
         .collect();
     let options = TeachOptions::default();
-    label_taught(view, prepared, &model.statistics, &votes, pinned, &options)
+    let known = (&learnt.model.statistics, learnt.prior.as_ref());
+    label_taught(view, prepared, known, &votes, pinned, &options)
 }

@@ -1,6 +1,6 @@
 //! What a collection has learnt becomes bytes and back: one safetensors buffer, kept in the catalog.
 
-use crate::labels::{LabelModel, Normalisation, Statistics};
+use crate::labels::{LabelModel, Normalisation, PriorLabels, Statistics};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
 use std::collections::HashMap;
 
@@ -12,6 +12,8 @@ use std::collections::HashMap;
 pub(super) struct Learnt {
     pub(super) model: LabelModel,
     pub(super) base: Statistics,
+    /// What was discovered before a person labelled anything, if that counts.
+    pub(super) prior: Option<PriorLabels>,
 }
 
 impl Learnt {
@@ -20,6 +22,7 @@ impl Learnt {
         Self {
             base: model.statistics.clone(),
             model,
+            prior: None,
         }
     }
 
@@ -42,7 +45,7 @@ impl Learnt {
             triangle(&m.statistics.moment, dim),
             triangle(&self.base.moment, dim),
         ];
-        let arrays: [(&str, Vec<usize>, &[f64]); 10] = [
+        let mut arrays: Vec<(&str, Vec<usize>, &[f64])> = vec![
             ("labels", vec![k], &labels),
             ("mean", vec![dim], &m.normalisation.mean),
             ("deviation", vec![dim], &m.normalisation.deviation),
@@ -54,6 +57,18 @@ impl Learnt {
             ("base_sums", vec![k, dim], &self.base.sums),
             ("base_moment", vec![triangles[1].len()], &triangles[1]),
         ];
+        let prior = self.prior.as_ref();
+        let of_prior = prior.map(|p| (p, triangle(&p.statistics.moment, dim), [p.agreement]));
+        if let Some((prior, moment, agreement)) = &of_prior {
+            let n = prior.statistics.counts.len();
+            arrays.extend([
+                ("prior_counts", vec![n], &prior.statistics.counts[..]),
+                ("prior_sums", vec![n, dim], &prior.statistics.sums),
+                ("prior_moment", vec![moment.len()], moment),
+                ("prior_meaning", vec![n, k], &prior.meaning),
+                ("prior_agreement", vec![1], agreement),
+            ]);
+        }
         let bytes: Vec<Vec<u8>> = arrays
             .iter()
             .map(|a| a.2.iter().flat_map(|x| x.to_le_bytes()).collect())
@@ -86,7 +101,7 @@ impl Learnt {
         };
         let (mean, deviation, labels) = (values("mean")?, values("deviation")?, values("labels")?);
         let (dim, k) = (mean.len(), labels.len());
-        let statistics = |prefix: &str| -> Result<Statistics, String> {
+        let statistics = |prefix: &str, k: usize| -> Result<Statistics, String> {
             let [counts, sums, moment] =
                 ["counts", "sums", "moment"].map(|n| values(&format!("{prefix}{n}")));
             let (counts, sums, moment) = (counts?, sums?, moment?);
@@ -107,6 +122,23 @@ impl Learnt {
                 deviation.len()
             ));
         }
+        let prior = match tensors.names().contains(&"prior_meaning") {
+            true => {
+                let (meaning, agreement) = (values("prior_meaning")?, values("prior_agreement")?);
+                let n = meaning.len() / k.max(1);
+                let ([agreement], true) = (&agreement[..], meaning.len() == n * k) else {
+                    return Err(format!(
+                        "label model: what was discovered does not fit {k} labels"
+                    ));
+                };
+                Some(PriorLabels {
+                    statistics: statistics("prior_", n)?,
+                    agreement: *agreement,
+                    meaning,
+                })
+            }
+            false => None,
+        };
         let up = <[f64; 3]>::try_from(values("up")?).ok();
         let normalisation = Normalisation {
             mean,
@@ -118,12 +150,13 @@ impl Learnt {
             epoch,
             labels,
             normalisation,
-            statistics: statistics("")?,
+            statistics: statistics("", k)?,
             up,
         };
         Ok(Self {
             model,
-            base: statistics("base_")?,
+            base: statistics("base_", k)?,
+            prior,
         })
     }
 }
@@ -153,6 +186,11 @@ mod tests {
 
     fn sample() -> Learnt {
         let dim = 4;
+        let prior = PriorLabels {
+            statistics: Statistics::empty(3, dim),
+            meaning: vec![0.5, 0.5, 0.25, 0.75, 1.0, 0.0],
+            agreement: 0.875,
+        };
         let statistics = Statistics {
             counts: vec![0.25, 0.75],
             sums: (0..8).map(f64::from).collect(),
@@ -171,13 +209,19 @@ mod tests {
             statistics,
             up,
         };
-        Learnt::begin(model)
+        Learnt {
+            prior: Some(prior),
+            ..Learnt::begin(model)
+        }
     }
 
     #[test]
     fn reads_back_what_was_written() {
         let learnt = sample();
-        assert_eq!(Learnt::decode(&learnt.encode()), Ok(learnt));
+        let discovered = Learnt::begin(learnt.model.clone());
+        for learnt in [learnt, discovered] {
+            assert_eq!(Learnt::decode(&learnt.encode()), Ok(learnt));
+        }
     }
 
     #[test]

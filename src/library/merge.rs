@@ -143,8 +143,9 @@ impl Library {
             let Some(learnt) = &lane.learnt else {
                 return Err(too_few(label));
             };
+            let pupils = pupils(lane);
             let chosen: Vec<usize> = (0..lane.shapes.len())
-                .filter(|at| lane.shapes[*at].pinned || !closed && pupils(lane).contains(at))
+                .filter(|at| lane.shapes[*at].pinned || !closed && pupils.contains(at))
                 .collect();
             let known: Vec<Known> = chosen
                 .iter()

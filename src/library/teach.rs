@@ -225,7 +225,10 @@ impl Library {
         };
         let taught = teach(&lessons, &maps, &given, k, &TeachOptions::default());
         model.statistics = taught.statistics;
-        let learnt = Learnt::begin(model);
+        let learnt = Learnt {
+            prior: taught.prior,
+            ..Learnt::begin(model)
+        };
         let changed: Vec<(usize, Result<Relabelled>)> = pupils
             .par_iter()
             .zip(&taught.labellings)
@@ -439,22 +442,15 @@ impl Library {
     }
 }
 
-/// The shapes that learn together: exemplars, and others spread evenly over the order of arrival.
+/// The shapes that learn together: exemplars and others, of each those of the least digests, by these.
 pub(super) fn pupils(lane: &Lane) -> Vec<usize> {
-    let spread = |all: Vec<usize>, limit: usize| -> Vec<usize> {
-        let n = all.len();
-        if n <= limit {
-            return all;
-        }
-        (0..limit).map(|i| all[i * n / limit]).collect()
+    let by_digest = lane.representatives(lane.shapes.len());
+    let of = |pinned: bool, limit: usize| {
+        let all = by_digest.iter().copied();
+        let all = all.filter(|at| lane.shapes[*at].pinned == pinned);
+        all.take(limit).collect::<Vec<usize>>()
     };
-    let of = |pinned: bool| {
-        (0..lane.shapes.len())
-            .filter(|at| lane.shapes[*at].pinned == pinned)
-            .collect()
-    };
-    let mut chosen = spread(of(true), MAX_TAUGHT_EXEMPLARS);
-    chosen.extend(spread(of(false), MAX_REPRESENTATIVES - chosen.len()));
-    chosen.sort_unstable();
+    let mut chosen = of(true, MAX_TAUGHT_EXEMPLARS);
+    chosen.extend(of(false, MAX_REPRESENTATIVES - chosen.len()));
     chosen
 }

@@ -13,14 +13,15 @@
 //! scatter within them as within true parts; and what each of them means in the person's words, seen by the faces
 //! that both label, says where the means of the person's labels are to be expected: the estimate is that with a conjugate prior
 //! worth so many exemplars (Gauvain and Lee 1994, *Maximum a Posteriori Estimation for Multivariate Gaussian Mixture
-//! Observations of Markov Chains*), which fades as exemplars come.
+//! Observations of Markov Chains*), which fades as exemplars come. Besides, a shape's own discovered labels, in the person's
+//! words, vote beside those that come through maps, and are believed as far as the person was found to agree with them.
 
 use super::place::{blended, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
 use crate::labels::cut::cut;
-use crate::labels::{Classifier, Statistics};
-use rayon::iter::{IntoParallelIterator, ParallelIterator};
+use crate::labels::{Classifier, Pinned, PriorLabels, Statistics};
+use rayon::iter::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
 /// Weights of teaching.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,6 +96,8 @@ pub struct LessonMap<'a> {
 pub struct Taught {
     /// What makes the discriminant.
     pub statistics: Statistics,
+    /// What the labels that were discovered before mean now.
+    pub prior: Option<PriorLabels>,
     /// Labelling of each lesson.
     pub labellings: Vec<Labelling>,
 }
@@ -138,13 +141,25 @@ pub fn teach(
         );
         certain.accumulate(&of_shape, options.pinned_weight);
     }
-    if let Some(discovered) = given.discovered {
+    let prior = given.discovered.map(|discovered| {
         let pinned = lessons.iter().filter(|l| !l.pinned.is_empty());
-        let labelled = pinned.map(|l| (&l.prepared.features, &*l.prepared.surface.area, l.pinned));
-        let prior = discovered.translated(&discovered.meaning(labelled, k), k);
+        let pinned = pinned.map(|l| Pinned {
+            surface: &l.prepared.surface,
+            features: &l.prepared.features,
+            classes: l.pinned,
+        });
+        PriorLabels::new(discovered.clone(), pinned, k)
+    });
+    if let Some(prior) = &prior {
+        let translated = prior.translated();
         let each = certain.total() / given.n_exemplars.max(1) as f64;
-        certain.accumulate(&prior, worth * each / prior.total().max(1e-12));
+        let weight = worth * each / translated.total().max(1e-12);
+        certain.accumulate(&translated, weight);
     }
+    let own: Vec<Option<OwnVote>> = lessons
+        .par_iter()
+        .map(|l| Some(OwnVote::new(&l.shape, l.prepared, prior.as_ref()?)))
+        .collect();
     let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
     let mut statistics = with_scatter(&certain);
     let mut labellings = Vec::new();
@@ -172,6 +187,7 @@ pub fn teach(
                 let evidence = Evidence {
                     classifier: &classifier,
                     votes: &into,
+                    own: own[to].as_ref(),
                     vote_share: options.vote_share,
                     pinned: lesson.pinned,
                 };
@@ -192,23 +208,26 @@ pub fn teach(
     }
     Taught {
         statistics,
+        prior,
         labellings,
     }
 }
 
-/// Labels a shape from what was taught: votes through maps from exemplars and representatives, the discriminant that
-/// `statistics` make, and the faces a person labelled, which keep their class.
+/// Labels a shape from what was taught: votes through maps from exemplars and representatives, and of the labels that were
+/// discovered before; the discriminant that `statistics` make; and the faces a person labelled, which keep their class.
 pub fn label_taught(
     shape: &DescriptionView<'_>,
     prepared: &Prepared,
-    statistics: &Statistics,
+    (statistics, prior): (&Statistics, Option<&PriorLabels>),
     votes: &[Vote<'_>],
     pinned: &[Option<u32>],
     options: &TeachOptions,
 ) -> Labelling {
+    let own = prior.map(|prior| OwnVote::new(shape, prepared, prior));
     let evidence = Evidence {
         classifier: &statistics.classifier().at_temperature(options.temperature),
         votes,
+        own: own.as_ref(),
         vote_share: options.vote_share,
         pinned,
     };
@@ -292,10 +311,31 @@ fn with_confident(
     all
 }
 
+/// What was discovered of a shape before a person labelled anything, as a vote through the map to itself.
+struct OwnVote {
+    probabilities: Vec<u8>,
+    p2p: Vec<u32>,
+    confidence: Confidence,
+}
+
+impl OwnVote {
+    fn new(shape: &DescriptionView<'_>, prepared: &Prepared, prior: &PriorLabels) -> Self {
+        let said = prior.probabilities(&prepared.surface, &prepared.features);
+        let n = shape.vertices.len();
+        Self {
+            probabilities: said.iter().map(|p| (p * 255.0).round() as u8).collect(),
+            p2p: (0..n as u32).collect(),
+            confidence: Confidence::everywhere(prior.agreement, n),
+        }
+    }
+}
+
 /// What is known of the labels of one shape.
 struct Evidence<'a> {
     classifier: &'a Classifier,
+    /// Through maps from other shapes.
     votes: &'a [Vote<'a>],
+    own: Option<&'a OwnVote>,
     vote_share: f64,
     pinned: &'a [Option<u32>],
 }
@@ -308,7 +348,19 @@ fn labelled(
     strength: f64,
 ) -> Labelling {
     let log_model = evidence.classifier.log_probabilities(&prepared.features);
-    let (carried, weights) = carried(shape, evidence.votes, k);
+    let mut votes = evidence.votes.to_vec();
+    votes.extend(evidence.own.map(|own| Vote {
+        faces: shape.faces,
+        probabilities: &own.probabilities,
+        p2p: &own.p2p,
+        confidence: &own.confidence,
+        trust: 1.0,
+    }));
+    let (carried, mut weights) = carried(shape, &votes, k);
+    // Those of the other shapes among themselves.
+    weights.truncate(evidence.votes.len());
+    let sum: f64 = weights.iter().sum();
+    weights.iter_mut().for_each(|w| *w /= sum.max(1e-300));
     let unary = blended(&log_model, &carried, evidence.vote_share, k);
     let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);
     let classes = cut(&prepared.surface, &unary, k, strength, fixed);
