@@ -5,6 +5,7 @@ use crate::harness::number;
 use coseg::store::check::check;
 use coseg::store::rows::ObjectKind;
 use coseg::store::{Store, StoreError};
+use std::collections::VecDeque;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
@@ -304,11 +305,24 @@ fn a_kill_during_the_recovery_from_a_kill_loses_nothing() {
     if !can_trace() {
         return;
     }
-    let n_first = number("COSEG_TEST_KILLS", 3) as u32;
-    let mut n_kills = 0;
-    for first in 0..n_first {
-        // In the middle of commits, and between the files and their rows.
-        let (call, n) = [("fdatasync", 5 + 2 * first), ("rename", 2 + first)][first as usize % 2];
+    let n_wanted = number("COSEG_TEST_KILLS", 3) as usize;
+    // In the middle of commits, between the files and their rows, and before; in turn, as long as such calls are made.
+    let mut firsts = VecDeque::from([
+        ("fdatasync", 5, 1),
+        ("rename", 2, 1),
+        ("pwrite64", 40, 7),
+        ("fsync", 1, 1),
+    ]);
+    let (mut n_kills, mut n_places) = (0_usize, 0);
+    while n_places < n_wanted
+        && let Some((call, n, step)) = firsts.pop_front()
+    {
+        let dir = tempfile::tempdir().expect("a folder");
+        if traced(dir.path(), call, "signal=KILL", n).ended {
+            continue;
+        }
+        firsts.push_back((call, n + step, step));
+        n_places += 1;
         for (again, limit) in [("fsync", 4), ("fdatasync", 4), ("pwrite64", 12)] {
             for m in (1..=limit).step_by(if again == "pwrite64" { 4 } else { 1 }) {
                 let dir = tempfile::tempdir().expect("a folder");
@@ -325,12 +339,13 @@ fn a_kill_during_the_recovery_from_a_kill_loses_nothing() {
                     n
                 };
                 assert_whole(dir.path(), heard, &context);
-                n_kills += u32::from(!one.ended) + u32::from(!two.ended);
+                n_kills += usize::from(!one.ended) + usize::from(!two.ended);
             }
         }
     }
-    println!("killed {n_kills} times, every second time during the recovery");
-    assert!(n_kills > 10 * n_first, "{n_kills}");
+    println!("killed {n_kills} times, first at {n_places} places, then during the recovery");
+    assert!(n_places >= n_wanted.min(20), "{n_places}");
+    assert!(n_kills > 10 * n_places, "{n_kills}");
 }
 
 #[test]
