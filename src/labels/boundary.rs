@@ -3,13 +3,12 @@
 //! Away from boundaries a face takes the label of its proxy face. In a band around them, about as wide as the
 //! proxy's triangles, a cut at full resolution decides.
 
-use super::cut::cut;
+use super::cut::{STRENGTH, cut};
 use crate::segmentation::{Surface, SurfaceEdge};
 
 /// Half width of the band, in mean edge lengths of the proxy.
 const BAND_EDGES: f64 = 1.5;
-/// Boundary strength of the cut, and the least probability that counts.
-const STRENGTH: f64 = 3.0;
+/// Least probability that counts.
 const FLOOR: f64 = 0.02;
 /// All this holds where an edge of the proxy is at most this many of the surface, plus one. On finer ones
 /// evidence, which grows with area, would outweigh boundaries, which grow with length, until labels follow the

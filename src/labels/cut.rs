@@ -4,6 +4,8 @@
 use crate::linalg::maxflow::Network;
 use crate::segmentation::Surface;
 
+/// Boundary strength with which shapes are labelled. While labels are discovered it is higher.
+pub const STRENGTH: f64 = 3.0;
 /// Energies are rounded to this many units a nat, so that cuts are exact in integers.
 const UNITS: f64 = 1e6;
 /// Evidence against a label counts at most this many nats.

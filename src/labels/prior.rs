@@ -1,11 +1,9 @@
 //! Labels that were discovered before a person gave others: what they mean in the person's words, and how far they agree.
 
-use super::cut::cut;
+use super::cut::{STRENGTH, cut};
 use super::{Features, Statistics};
 use crate::segmentation::Surface;
 
-/// Boundary strength of the cut, as in labelling.
-const STRENGTH: f64 = 3.0;
 /// Share of a shape's area that is added to what is seen of the meaning of a label, spread over all classes.
 const UNSEEN_AREA: f64 = 0.05;
 

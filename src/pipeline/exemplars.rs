@@ -19,7 +19,7 @@
 use super::place::{blended, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
-use crate::labels::cut::cut;
+use crate::labels::cut::{STRENGTH, cut};
 use crate::labels::{Classifier, Pinned, PriorLabels, Statistics};
 use rayon::iter::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
@@ -60,7 +60,7 @@ impl Default for TeachOptions {
             confident: 0.7,
             discovered_exemplars: 2.0,
             temperature: 2.0,
-            strength: 3.0,
+            strength: STRENGTH,
         }
     }
 }

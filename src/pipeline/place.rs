@@ -6,7 +6,7 @@ use crate::fmap::{
     Confidence, FunctionalMap, MapOptions, MapShape, descriptor_zoomout, descriptor_zoomout_from,
     nearest_descriptors,
 };
-use crate::labels::cut::cut;
+use crate::labels::cut::{STRENGTH, cut};
 use crate::labels::{Features, LabelModel, Statistics};
 use crate::linalg::nearest::nearest_rows;
 use crate::segmentation::Surface;
@@ -15,8 +15,6 @@ use crate::segmentation::Surface;
 pub(super) const FLOOR: f64 = 0.02;
 /// Share of the carried vote, the rest being the label model's, in the log-linear mean.
 const VOTE_SHARE: f64 = 0.5;
-/// Boundary strength of the cut.
-const STRENGTH: f64 = 3.0;
 /// A vote weighs, at each vertex, this power of the odds that it is right there.
 const ODDS_POWER: f64 = 2.0;
 /// Confidence beyond which nobody is believed more, or less than one minus which, less.

@@ -4,15 +4,13 @@
 //! the two groups and a cut within the label then decide face by face.
 
 use super::Prepared;
-use crate::labels::cut::cut;
+use crate::labels::cut::{STRENGTH, cut};
 use crate::labels::{Classifier, Statistics};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::Surface;
 
 const SEED: u64 = 1;
 const N_STARTS: usize = 10;
-/// Boundary strength of the cut, as in labelling.
-const STRENGTH: f64 = 3.0;
 
 /// The discriminant of the two halves of a label, given the shapes, the patch of each of their faces, and which of
 /// these carry the label. The second class is the smaller one. `None`: it has fewer than two patches.
