@@ -4,6 +4,6 @@ mod parts;
 mod patches;
 mod surface;
 
-pub use parts::{PartGraph, merge_patches};
+pub use parts::{PartGraph, merge_patches, parts};
 pub use patches::patches;
 pub use surface::{PatchGraph, Surface, SurfaceEdge};

@@ -142,6 +142,21 @@ pub fn merge_patches(
         .collect()
 }
 
+/// Part of each face `(m,)`, numbered from 0 without gaps, when its `patches (m,)` are merged until `n` parts are left
+/// (or more, see [`merge_patches`]), by standardised descriptors `(m, dim)`.
+pub fn parts(
+    surface: &Surface,
+    patches: &[u32],
+    descriptors: &[f32],
+    dim: usize,
+    n: usize,
+) -> Vec<u32> {
+    let graph = PatchGraph::new(surface, patches);
+    let means = surface.patch_means(patches, graph.len(), descriptors, dim);
+    let part_of_patch = merge_patches(&graph, &means, dim, &[n]).remove(0);
+    patches.iter().map(|p| part_of_patch[*p as usize]).collect()
+}
+
 fn numbered(region: &[u32]) -> Vec<u32> {
     let mut number = BTreeMap::new();
     for r in region {
@@ -293,4 +308,54 @@ fn extents(surface: &Surface, part_of_face: &[u32], area: &[f64]) -> Vec<[f64; 3
             e
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::{DualGraph, TriMesh, bridges, clean, zoo};
+    use crate::segmentation::patches;
+
+    /// A valley of two sheets, its patches, and a descriptor that hardly differs from place to place.
+    fn valley() -> (TriMesh, Surface, Vec<u32>, Vec<f32>) {
+        let mut mesh = zoo::grid(40, 20);
+        for p in &mut mesh.vertices {
+            p[2] = 2.0 * (p[0] - 20.0).abs();
+        }
+        let mesh = clean(&zoo::parsed(&mesh)).unwrap().mesh;
+        let surface = Surface::new(&mesh);
+        let patch = patches(&mesh, &DualGraph::new(&mesh, &bridges(&mesh)), 0, 20);
+        let along = surface.centroids.iter().map(|c| 0.01 * c[1] as f32);
+        let descriptors = along.collect();
+        (mesh, surface, patch, descriptors)
+    }
+
+    #[test]
+    fn the_sheets_of_a_valley_are_two_parts() {
+        let (_, surface, patch, descriptors) = valley();
+        let part = parts(&surface, &patch, &descriptors, 1, 2);
+        assert_eq!(part.iter().max(), Some(&1));
+        let side = |f: usize| surface.centroids[f][0] > 20.0;
+        let mut sides = [[0.0; 2]; 2];
+        for (f, p) in part.iter().enumerate() {
+            sides[*p as usize][usize::from(side(f))] += surface.area[f];
+        }
+        let astray: f64 = sides.iter().map(|s| s[0].min(s[1])).sum();
+        assert!(astray < 0.02, "{sides:?}");
+    }
+
+    #[test]
+    fn parts_nest_and_are_the_patches_at_most() {
+        let (_, surface, patch, descriptors) = valley();
+        let of = |n| parts(&surface, &patch, &descriptors, 1, n);
+        assert_eq!(of(1_000), patch);
+        for n in 1..10 {
+            let (coarse, fine) = (of(n), of(n + 1));
+            assert_eq!(coarse.iter().max(), Some(&(n as u32 - 1)));
+            let mut within = vec![None; n + 1];
+            for (c, f) in coarse.iter().zip(&fine) {
+                assert_eq!(within[*f as usize].replace(c).unwrap_or(c), c, "{n}");
+            }
+        }
+    }
 }

@@ -83,11 +83,11 @@ impl Surface {
     }
 
     /// Area-weighted mean of the rows of `values (m, dim)` over each patch; `(n_patches, dim)`.
-    pub fn patch_means(
+    pub fn patch_means<T: Copy + Into<f64>>(
         &self,
         patches: &[u32],
         n_patches: usize,
-        values: &[f32],
+        values: &[T],
         dim: usize,
     ) -> Vec<f64> {
         let mut mean = vec![0.0; n_patches * dim];
@@ -99,7 +99,7 @@ impl Surface {
                 .iter_mut()
                 .zip(&values[face * dim..])
             {
-                *s += self.area[face] * f64::from(x);
+                *s += self.area[face] * x.into();
             }
         }
         for (row, a) in mean.chunks_exact_mut(dim).zip(&area) {
