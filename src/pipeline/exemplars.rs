@@ -15,6 +15,9 @@
 //! worth so many exemplars (Gauvain and Lee 1994, *Maximum a Posteriori Estimation for Multivariate Gaussian Mixture
 //! Observations of Markov Chains*), which fades as exemplars come. Besides, a shape's own discovered labels, in the person's
 //! words, vote beside those that come through maps, and are believed as far as the person was found to agree with them.
+//!
+//! Before the cut a face's evidence is mixed with the mean over the part of the shape that it is in: a limb is of one label
+//! more often than evidence face by face says.
 
 use super::place::{blended, carried};
 use super::{DescriptionView, Labelling, Prepared, Vote};
@@ -50,8 +53,7 @@ pub struct TeachOptions {
     pub discovered_exemplars: f64,
     /// Temperature of the discriminant, which is trained on few shapes and too certain.
     pub temperature: f64,
-    /// Share, in what each class of a face costs, of the mean over the part that the face is in: a person seldom cuts a
-    /// limb across where nothing marks it, but evidence face by face does.
+    /// Share, in what each class of a face costs, of the mean over the part that the face is in.
     pub part_share: f64,
     /// Boundary strength of the cut.
     pub strength: f64,

@@ -313,11 +313,11 @@ fn extents(surface: &Surface, part_of_face: &[u32], area: &[f64]) -> Vec<[f64; 3
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::{DualGraph, TriMesh, bridges, clean, zoo};
+    use crate::mesh::{DualGraph, bridges, clean, zoo};
     use crate::segmentation::patches;
 
     /// A valley of two sheets, its patches, and a descriptor that hardly differs from place to place.
-    fn valley() -> (TriMesh, Surface, Vec<u32>, Vec<f32>) {
+    fn valley() -> (Surface, Vec<u32>, Vec<f32>) {
         let mut mesh = zoo::grid(40, 20);
         for p in &mut mesh.vertices {
             p[2] = 2.0 * (p[0] - 20.0).abs();
@@ -327,12 +327,12 @@ mod tests {
         let patch = patches(&mesh, &DualGraph::new(&mesh, &bridges(&mesh)), 0, 20);
         let along = surface.centroids.iter().map(|c| 0.01 * c[1] as f32);
         let descriptors = along.collect();
-        (mesh, surface, patch, descriptors)
+        (surface, patch, descriptors)
     }
 
     #[test]
     fn the_sheets_of_a_valley_are_two_parts() {
-        let (_, surface, patch, descriptors) = valley();
+        let (surface, patch, descriptors) = valley();
         let part = parts(&surface, &patch, &descriptors, 1, 2);
         assert_eq!(part.iter().max(), Some(&1));
         let side = |f: usize| surface.centroids[f][0] > 20.0;
@@ -346,7 +346,7 @@ mod tests {
 
     #[test]
     fn parts_nest_and_are_the_patches_at_most() {
-        let (_, surface, patch, descriptors) = valley();
+        let (surface, patch, descriptors) = valley();
         let of = |n| parts(&surface, &patch, &descriptors, 1, n);
         assert_eq!(of(1_000), patch);
         for n in 1..10 {
