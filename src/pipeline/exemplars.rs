@@ -171,6 +171,10 @@ pub fn teach(
         .par_iter()
         .map(|l| Some(OwnVote::new(&l.shape, l.prepared, prior.as_ref()?)))
         .collect();
+    let part_of: Vec<Vec<u32>> = lessons
+        .par_iter()
+        .map(|l| parts_for(&l.shape, l.prepared, k))
+        .collect();
     let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
     let mut statistics = with_scatter(&certain);
     let mut labellings = Vec::new();
@@ -199,6 +203,7 @@ pub fn teach(
                     classifier: &classifier,
                     votes: &into,
                     own: own[to].as_ref(),
+                    part_of: &part_of[to],
                     pinned: lesson.pinned,
                 };
                 labelled(&lesson.shape, lesson.prepared, &evidence, k, options)
@@ -227,14 +232,16 @@ pub fn label_taught(
     pinned: &[Option<u32>],
     options: &TeachOptions,
 ) -> Labelling {
+    let k = statistics.counts.len();
     let own = prior.map(|prior| OwnVote::new(shape, prepared, prior));
     let evidence = Evidence {
         classifier: &statistics.classifier().at_temperature(options.temperature),
         votes,
         own: own.as_ref(),
+        part_of: &parts_for(shape, prepared, k),
         pinned,
     };
-    labelled(shape, prepared, &evidence, statistics.counts.len(), options)
+    labelled(shape, prepared, &evidence, k, options)
 }
 
 /// Classes of proxy faces `(m,)`, given those of the polygons `(n_polygons,)`: a face is pinned if most of the area that
@@ -327,12 +334,21 @@ impl OwnVote {
     }
 }
 
+/// Part of each face `(m,)` of a shape that is to be labelled in `k` classes.
+fn parts_for(shape: &DescriptionView<'_>, prepared: &Prepared, k: usize) -> Vec<u32> {
+    let (surface, features) = (&prepared.surface, &prepared.features);
+    let n = N_PARTS_A_CLASS * k + N_PARTS_MORE;
+    parts(surface, shape.patches, &features.data, features.dim, n)
+}
+
 /// What is known of the labels of one shape.
 struct Evidence<'a> {
     classifier: &'a Classifier,
     /// Through maps from other shapes.
     votes: &'a [Vote<'a>],
     own: Option<&'a OwnVote>,
+    /// Part of each face `(m,)`.
+    part_of: &'a [u32],
     pinned: &'a [Option<u32>],
 }
 
@@ -358,16 +374,8 @@ fn labelled(
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum.max(1e-300));
     let unary = blended(&log_model, &carried, options.vote_share, k);
-    let (surface, features) = (&prepared.surface, &prepared.features);
-    let n_parts = N_PARTS_A_CLASS * k + N_PARTS_MORE;
-    let part_of = parts(
-        surface,
-        shape.patches,
-        &features.data,
-        features.dim,
-        n_parts,
-    );
-    let unary = shared_by_parts(unary, surface, &part_of, k, options.part_share);
+    let part_of = evidence.part_of;
+    let unary = shared_by_parts(unary, &prepared.surface, part_of, k, options.part_share);
     let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);
     let classes = cut(&prepared.surface, &unary, k, options.strength, fixed);
     let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();
