@@ -7,15 +7,12 @@
 
 // In the order in which data flows: a module names only modules before it (tests/it/tidy.rs).
 
+// Geometry: one or two meshes in, values out; a crate of its own.
+pub use coseg_geometry::{
+    description, descriptors, fmap, linalg, mesh, operators, segmentation, spectrum,
+};
+
 // Pure: values in, values out.
-pub mod linalg;
-pub mod mesh;
-pub mod operators;
-pub mod spectrum;
-pub mod description;
-pub mod descriptors;
-pub mod segmentation;
-pub mod fmap;
 pub mod correspondence;
 pub mod labels;
 pub mod neighbors;
