@@ -10,7 +10,6 @@ pub(crate) use carrying::{Map, Transfer};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
 
-use crate::commands::bench::Bench;
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
@@ -157,9 +156,6 @@ pub(crate) enum Command {
     Synth(SynthArgs),
     /// Run the main job on a made family, end to end, in a temporary library
     Demo(DemoArgs),
-    /// Measure on meshes with known answers, in temporary libraries
-    #[command(subcommand)]
-    Bench(Bench),
     /// List jobs, or the shapes that failed and why
     Jobs(Jobs),
     /// Queue the failed shapes of a job again

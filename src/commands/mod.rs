@@ -1,13 +1,6 @@
 //! What each subcommand does: one file each.
 
 mod add;
-pub(crate) mod bench;
-mod bench_carry;
-mod bench_labels;
-mod bench_made;
-mod bench_maps;
-mod bench_partial;
-mod bench_signatures;
 mod check;
 mod collections;
 mod completions;
@@ -199,7 +192,6 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
             .map(|()| true)
             .map_err(Into::into),
         Command::Demo(args) => demo::run(args, &cli.global),
-        Command::Bench(args) => bench::run(args, &cli.global),
         Command::Jobs(args) => jobs::jobs(args, session()?),
         Command::Retry(args) => jobs::retry(args, session()?),
         Command::Keys(args) => keys::run(args, &cli.global),

@@ -1,9 +1,9 @@
-//! `coseg bench maps --labels`: how well maps carry labels from a few shapes to another, and how well it is known beforehand.
+//! `coseg-bench maps --labels`: how well maps carry labels from a few shapes to another, and how well it is known beforehand.
 
-use super::bench_labels::{Category, Known, categories};
-use super::session::{print_line, table};
-use super::{CommandError, Outcome, bench_partial};
-use crate::cli::Global;
+use crate::error::{BenchError, Outcome};
+use crate::print::{print_line, table};
+use crate::stream::{Category, Known, categories};
+use crate::{Global, partial};
 use coseg::fmap::confidence::{figures, fitted, logistic, of_map};
 use coseg::fmap::{Confidence, FunctionalMap, MapOptions};
 use coseg::ipc::convert::format_from_wire;
@@ -38,23 +38,23 @@ const ARMS: [&str; 5] = [
 const RANKINGS: [&str; 3] = ["signature", "as placed", "confidence"];
 
 /// A described shape with its true labels.
-pub(super) struct Labelled {
-    pub(super) description: Description,
+pub(crate) struct Labelled {
+    pub(crate) description: Description,
     /// Class of each polygon.
-    pub(super) truth: Vec<u32>,
+    pub(crate) truth: Vec<u32>,
     /// Class of most of each proxy face.
-    pub(super) of_face: Vec<Option<u32>>,
+    pub(crate) of_face: Vec<Option<u32>>,
 }
 
 /// The shapes of a category, ready to be mapped.
-pub(super) struct Ready {
-    pub(super) shapes: Vec<Labelled>,
-    pub(super) prepared: Vec<Prepared>,
-    pub(super) model: LabelModel,
+pub(crate) struct Ready {
+    pub(crate) shapes: Vec<Labelled>,
+    pub(crate) prepared: Vec<Prepared>,
+    pub(crate) model: LabelModel,
     /// Classes.
-    pub(super) k: usize,
+    pub(crate) k: usize,
     /// The labels they stand for.
-    pub(super) kinds: Vec<i32>,
+    pub(crate) kinds: Vec<i32>,
 }
 
 /// One ordered pair of shapes.
@@ -77,11 +77,11 @@ struct Row {
     oracle: f64,
     /// Of each map what is known beforehand, and its accuracy.
     maps: Vec<([f64; 5], f64)>,
-    matched: bench_partial::Mask,
+    matched: partial::Mask,
     map_ms: f64,
 }
 
-pub(super) fn run(data: &Path, wanted: &[String], global: &Global) -> Outcome {
+pub(crate) fn run(data: &Path, wanted: &[String], global: &Global) -> Outcome {
     let mut rows = Vec::new();
     for category in categories(data, wanted, None)? {
         let row = bench(&category)?;
@@ -94,7 +94,7 @@ pub(super) fn run(data: &Path, wanted: &[String], global: &Global) -> Outcome {
     Ok(true)
 }
 
-pub(super) fn described(shape: &Known) -> Result<Description, CommandError> {
+pub(crate) fn described(shape: &Known) -> Result<Description, BenchError> {
     let format = format_from_wire(shape.format);
     describe(
         &shape.bytes,
@@ -102,10 +102,10 @@ pub(super) fn described(shape: &Known) -> Result<Description, CommandError> {
         &Params::default(),
         &|_| true,
     )
-    .map_err(|e| CommandError::Failed(e.to_string()))
+    .map_err(|e| BenchError::Failed(e.to_string()))
 }
 
-pub(super) fn prepared(category: &Category) -> Result<Ready, CommandError> {
+pub(crate) fn prepared(category: &Category) -> Result<Ready, BenchError> {
     let mut kinds: Vec<i32> = category
         .shapes
         .iter()
@@ -118,7 +118,7 @@ pub(super) fn prepared(category: &Category) -> Result<Ready, CommandError> {
         .shapes
         .par_iter()
         .map(|shape| Ok(labelled(described(shape)?, &shape.truth, &kinds)))
-        .collect::<Result<_, CommandError>>()?;
+        .collect::<Result<_, BenchError>>()?;
     let raw: Vec<(Features, Surface)> = shapes
         .par_iter()
         .map(|s| {
@@ -148,7 +148,7 @@ pub(super) fn prepared(category: &Category) -> Result<Ready, CommandError> {
     })
 }
 
-pub(super) fn labelled(description: Description, truth: &[i32], kinds: &[i32]) -> Labelled {
+pub(crate) fn labelled(description: Description, truth: &[i32], kinds: &[i32]) -> Labelled {
     let class = |l: &i32| kinds.partition_point(|k| k < l) as u32;
     let truth: Vec<u32> = truth.iter().map(class).collect();
     let pins: Vec<Option<u32>> = truth.iter().map(|c| Some(*c)).collect();
@@ -183,7 +183,7 @@ impl Labelled {
     }
 }
 
-fn bench(category: &Category) -> Result<Row, CommandError> {
+fn bench(category: &Category) -> Result<Row, BenchError> {
     let prep = prepared(category)?;
     let n = prep.shapes.len();
     let votes: Vec<Vec<u8>> = prep.shapes.iter().map(|s| s.vote(prep.k)).collect();
@@ -244,7 +244,7 @@ fn bench(category: &Category) -> Result<Row, CommandError> {
             .flatten()
             .map(|p| (figures(&p.map.quality), p.accuracy))
             .collect(),
-        matched: bench_partial::cut_away(category, &prep)?,
+        matched: partial::cut_away(category, &prep)?,
         map_ms,
     })
 }
@@ -423,14 +423,14 @@ fn calibration(rows: &[Row]) -> (Vec<(usize, f64, f64)>, f64) {
     (bins.collect(), correlation)
 }
 
-fn print(rows: &[Row], global: &Global) -> Result<(), CommandError> {
+fn print(rows: &[Row], global: &Global) -> Result<(), BenchError> {
     let n = rows.len().max(1) as f64;
     let mean = |f: &dyn Fn(&Row) -> f64| rows.iter().map(f).sum::<f64>() / n;
     let (bins, correlation) = calibration(rows);
     let all: Vec<([f64; 5], f64)> = rows.iter().flat_map(|r| r.maps.clone()).collect();
     let weights = fitted(&all);
-    let masks: Vec<&bench_partial::Mask> = rows.iter().map(|r| &r.matched).collect();
-    let mask = bench_partial::Mask::sum(&masks);
+    let masks: Vec<&partial::Mask> = rows.iter().map(|r| &r.matched).collect();
+    let mask = partial::Mask::sum(&masks);
     if global.json {
         let of = |r: &Row| {
             json!({"category": r.name, "labelled_19": r.accuracy[0], "labelled_5": r.accuracy[1],

@@ -1,9 +1,7 @@
 //! Meshes with known parts go through a daemon's socket in some order, and through the baselines in process.
 
-use super::demo::at;
-use super::session::Session;
-use super::{CommandError, labels};
-use crate::cli::Settings;
+use crate::error::BenchError;
+use crate::session::{COLLECTION, Session};
 use bytes::Bytes;
 use coseg::call;
 use coseg::ipc::client::unexpected;
@@ -28,8 +26,6 @@ use std::time::Instant;
 
 /// What lies beside a mesh and holds its true labels.
 const TRUTH: &str = ".labels.txt";
-/// Name of the one collection of a daemon.
-const COLLECTION: &str = "bench";
 /// The stages after a shape is described.
 const PLACING: [&str; 4] = ["store", "place", "recluster", "boundary"];
 /// Most shapes that are labelled at once in process: the cost grows with the square.
@@ -66,15 +62,15 @@ pub(crate) struct Run {
     labels: Vec<Option<Vec<i32>>>,
 }
 
-fn failed(path: &Path, what: impl std::fmt::Display) -> CommandError {
-    CommandError::Failed(format!("{}: {what}", path.display()))
+fn failed(path: &Path, what: impl std::fmt::Display) -> BenchError {
+    BenchError::Failed(format!("{}: {what}", path.display()))
 }
 
-fn names_in(dir: &Path) -> Result<Vec<PathBuf>, CommandError> {
-    let entries = std::fs::read_dir(dir).map_err(|e| at(dir, e))?;
+fn names_in(dir: &Path) -> Result<Vec<PathBuf>, BenchError> {
+    let entries = std::fs::read_dir(dir).map_err(|e| BenchError::file(dir, e))?;
     let mut paths = Vec::new();
     for entry in entries {
-        paths.push(entry.map_err(|e| at(dir, e))?.path());
+        paths.push(entry.map_err(|e| BenchError::file(dir, e))?.path());
     }
     paths.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()));
     Ok(paths)
@@ -89,7 +85,7 @@ pub(crate) fn categories(
     data: &Path,
     wanted: &[String],
     limit: Option<u32>,
-) -> Result<Vec<Category>, CommandError> {
+) -> Result<Vec<Category>, BenchError> {
     let name_of = |dir: &Path| {
         let name = dir.file_name().map(|n| n.to_string_lossy().into_owned());
         name.unwrap_or_else(|| COLLECTION.to_owned())
@@ -122,21 +118,21 @@ pub(crate) fn categories(
                 "{} has no category {name} with {TRUTH} files",
                 data.display()
             );
-            Err(CommandError::Usage(text))
+            Err(BenchError::Usage(text))
         }
         None if found.is_empty() => {
             let text = format!("{} has no folders with {TRUTH} files", data.display());
-            Err(CommandError::Usage(text))
+            Err(BenchError::Usage(text))
         }
         None => Ok(found),
     }
 }
 
-fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, CommandError> {
+fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, BenchError> {
     let mut shapes = Vec::new();
     let limit = limit.map_or(usize::MAX, |n| n as usize);
     for path in names_in(dir)?.iter().filter(|p| is_truth(p)).take(limit) {
-        let text = std::fs::read_to_string(path).map_err(|e| at(path, e))?;
+        let text = std::fs::read_to_string(path).map_err(|e| BenchError::file(path, e))?;
         let truth: Result<Vec<i32>, _> = text.split_whitespace().map(str::parse).collect();
         let truth = truth.map_err(|e| failed(path, e))?;
         let file = path.file_name().unwrap_or_default().to_string_lossy();
@@ -147,7 +143,7 @@ fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, CommandError> {
         } else {
             (dir.join(format!("{name}.obj")), Format::Obj)
         };
-        let bytes = std::fs::read(&mesh_path).map_err(|e| at(&mesh_path, e))?;
+        let bytes = std::fs::read(&mesh_path).map_err(|e| BenchError::file(&mesh_path, e))?;
         let parsed = mesh::parse(&bytes, format).map_err(|e| failed(&mesh_path, e))?;
         if parsed.triangles.len() != parsed.n_polygons {
             let n = parsed.n_polygons;
@@ -174,7 +170,7 @@ fn scored<'a>(
     category: &str,
     shapes: impl Iterator<Item = &'a Known>,
     labels: &'a [Option<Vec<i32>>],
-) -> Result<Score, CommandError> {
+) -> Result<Score, BenchError> {
     let shapes: Vec<ScoredShape<'_>> = shapes
         .zip(labels)
         .map(|(s, labels)| ScoredShape {
@@ -183,7 +179,7 @@ fn scored<'a>(
             predicted: labels.as_deref(),
         })
         .collect();
-    score(&shapes).map_err(|e| CommandError::Failed(format!("{category}: {e}")))
+    score(&shapes).map_err(|e| BenchError::Failed(format!("{category}: {e}")))
 }
 
 /// The order of arrival: that of the names first, then shuffled ones.
@@ -202,13 +198,13 @@ pub(crate) fn stream(
     n_parts: u32,
     up: wire::Up,
     session: &mut Session,
-) -> Result<Run, CommandError> {
+) -> Result<Run, BenchError> {
     let begin = Instant::now();
-    let settings = Settings {
-        parts: Some(n_parts),
-        up: Some(up),
-        operator: None,
-        working_faces: None,
+    let spec = wire::CollectionSpec {
+        name: COLLECTION.to_owned(),
+        n_parts: Some(n_parts),
+        up: up.into(),
+        ..wire::CollectionSpec::default()
     };
     let mut place_ms = Vec::with_capacity(category.shapes.len());
     for i in arrival(category.shapes.len(), order) {
@@ -225,14 +221,14 @@ pub(crate) fn stream(
                 source: Some(Source::Encoded(encoded)),
             }],
             mode: wire::AddMode::Job.into(),
-            create: Some(settings.to_spec(COLLECTION)),
+            create: Some(spec.clone()),
         });
         let frames = [shape.bytes.clone()];
         let job_id = match session.client.call_patiently(&body, &frames)? {
             (reply::Result::AddShapes(reply), _) => reply.job_id,
             (other, _) => return Err(unexpected(&other).into()),
         };
-        place_ms.extend(wait(job_id, session)?);
+        place_ms.extend(placing_ms(session.finished(job_id)?));
     }
     let labels = labels_now(category, session)?;
     let score = scored(&category.name, category.shapes.iter(), &labels)?;
@@ -253,23 +249,13 @@ pub(crate) fn stream(
 fn labels_now(
     category: &Category,
     session: &mut Session,
-) -> Result<Vec<Option<Vec<i32>>>, CommandError> {
-    session.wait_until_idle(COLLECTION)?;
-    let there: BTreeSet<String> = session
-        .shapes(COLLECTION, None)?
-        .into_iter()
-        .map(|s| s.name)
-        .collect();
+) -> Result<Vec<Option<Vec<i32>>>, BenchError> {
+    session.wait_until_idle()?;
+    let there: BTreeSet<String> = session.shapes()?.into_iter().collect();
     let mut labels = Vec::new();
     for shape in &category.shapes {
         labels.push(if there.contains(&shape.name) {
-            let request = wire::GetLabelsRequest {
-                collection: COLLECTION.to_owned(),
-                shape: shape.name.clone(),
-                version: 0,
-                confidence: false,
-            };
-            Some(labels::receive(session, request)?.labels)
+            Some(session.labels(&shape.name)?)
         } else {
             None
         });
@@ -283,12 +269,12 @@ pub(crate) fn with_exemplars(
     category: &Category,
     counts: &[usize],
     session: &mut Session,
-) -> Result<Vec<f64>, CommandError> {
+) -> Result<Vec<f64>, BenchError> {
     let mut labelled = BTreeSet::new();
     let mut accuracies = Vec::with_capacity(counts.len());
     for &count in counts {
         while labelled.len() < count {
-            session.wait_until_idle(COLLECTION)?;
+            session.wait_until_idle()?;
             let collection = COLLECTION.to_owned();
             let suggested = call!(
                 session.client,
@@ -299,7 +285,7 @@ pub(crate) fn with_exemplars(
                 .iter()
                 .position(|s| s.name == suggested.shape);
             let at = at.ok_or_else(|| {
-                CommandError::Failed(format!("{:?} was suggested and not sent", suggested.shape))
+                BenchError::Failed(format!("{:?} was suggested and not sent", suggested.shape))
             })?;
             let truth = &category.shapes[at].truth;
             let mut frames = FrameWriter::default();
@@ -328,34 +314,28 @@ pub(crate) fn with_exemplars(
             .collect();
         let accuracy = accuracy_by_id(&others);
         accuracies
-            .push(accuracy.map_err(|e| CommandError::Failed(format!("{}: {e}", category.name)))?);
+            .push(accuracy.map_err(|e| BenchError::Failed(format!("{}: {e}", category.name)))?);
     }
     Ok(accuracies)
 }
 
-/// Waits for a job; milliseconds that placing each of its shapes took.
-fn wait(job_id: u64, session: &mut Session) -> Result<Vec<f64>, CommandError> {
-    let mut revision = 0;
-    loop {
-        let job = session.watch_job(job_id, &mut revision)?;
-        if job.finished {
-            let of_shape = |item: wire::JobItem| {
-                let stages = item.placed.unwrap_or_default().stages.into_iter();
-                let placing = stages.filter(|s| PLACING.contains(&s.stage.as_str()));
-                placing.map(|s| s.ms).sum()
-            };
-            return Ok(job.items.into_iter().map(of_shape).collect());
-        }
-    }
+/// Milliseconds that placing each shape of a job took, once the job is finished.
+fn placing_ms(job: wire::Job) -> Vec<f64> {
+    let of_shape = |item: wire::JobItem| {
+        let stages = item.placed.unwrap_or_default().stages.into_iter();
+        let placing = stages.filter(|s| PLACING.contains(&s.stage.as_str()));
+        placing.map(|s| s.ms).sum()
+    };
+    job.items.into_iter().map(of_shape).collect()
 }
 
 /// Writes the labels of a run, one file a shape.
-pub(crate) fn write(category: &Category, run: &Run, out: &Path) -> Result<(), CommandError> {
-    std::fs::create_dir_all(out).map_err(|e| at(out, e))?;
+pub(crate) fn write(category: &Category, run: &Run, out: &Path) -> Result<(), BenchError> {
+    std::fs::create_dir_all(out).map_err(|e| BenchError::file(out, e))?;
     for (shape, labels) in category.shapes.iter().zip(&run.labels) {
         let text: String = labels.iter().flatten().map(|l| format!("{l}\n")).collect();
         let path = out.join(format!("{}{TRUTH}", shape.name));
-        std::fs::write(&path, text).map_err(|e| at(&path, e))?;
+        std::fs::write(&path, text).map_err(|e| BenchError::file(&path, e))?;
     }
     Ok(())
 }
@@ -365,7 +345,7 @@ pub(crate) fn write(category: &Category, run: &Run, out: &Path) -> Result<(), Co
 pub(crate) fn others(
     category: &Category,
     library: &Path,
-) -> Result<Vec<(&'static str, f64)>, CommandError> {
+) -> Result<Vec<(&'static str, f64)>, BenchError> {
     let library = Library::open(library)?;
     let up = library.collection(COLLECTION)?.spec.up.axis();
     let mut kept = Vec::new();
@@ -386,7 +366,7 @@ pub(crate) fn others(
         });
     }
     let views: Vec<DescriptionView<'_>> = kept.iter().map(|k| k.1.view()).collect();
-    let accuracy = |of_proxy: Vec<Vec<u32>>| -> Result<f64, CommandError> {
+    let accuracy = |of_proxy: Vec<Vec<u32>>| -> Result<f64, BenchError> {
         let labels: Vec<Option<Vec<i32>>> = views
             .iter()
             .zip(of_proxy)
@@ -404,9 +384,8 @@ pub(crate) fn others(
         out.push((name, accuracy(batch(&views, k, up, Some(which)))?));
     }
     let seed = DiscoveryOptions::default().seed;
-    let literally = literal(&views, k, seed).map_err(|e| {
-        CommandError::Failed(format!("{}, the paper literally: {e}", category.name))
-    })?;
+    let literally = literal(&views, k, seed)
+        .map_err(|e| BenchError::Failed(format!("{}, the paper literally: {e}", category.name)))?;
     out.push(("the paper literally", accuracy(literally)?));
     Ok(out)
 }

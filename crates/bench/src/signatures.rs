@@ -1,14 +1,14 @@
-//! `coseg bench signatures`: how fast signatures are computed from eigenvectors, beside a plain copy of them.
+//! `coseg-bench signatures`: how fast signatures are computed from eigenvectors, beside a plain copy of them.
 
-use super::Outcome;
-use super::session::{print_line, table};
-use crate::cli::Global;
+use crate::Global;
+use crate::error::Outcome;
+use crate::print::{print_line, table};
 use clap::Args;
 use coseg::descriptors::{PointKernels, gps_scales, hks_times};
 use serde_json::{Value, json};
 use std::time::Instant;
 
-/// `coseg bench signatures`
+/// `coseg-bench signatures`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchSignatures {
     /// Vertices

@@ -1,7 +1,7 @@
 //! Pairs of which one shape lacks a part, has a component more, or a handle: made from meshes whose correspondence is known.
 
-use super::CommandError;
-use super::bench_maps::{Meshed, Score, load_mesh, meshed, numbers, scored};
+use crate::error::BenchError;
+use crate::maps::{Meshed, Score, load_mesh, meshed, numbers, scored};
 use coseg::fmap::{EstimateOptions, PointMap};
 use coseg::mesh::{EdgeGraph, FaceGeometry, TriMesh};
 use std::path::PathBuf;
@@ -11,7 +11,7 @@ const SHARE: f64 = 0.1;
 
 /// What is done to one of the shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Change {
+pub(crate) enum Change {
     /// An extremity of the first is cut away.
     Cut,
     /// A sphere lies beside the second.
@@ -21,7 +21,7 @@ pub(super) enum Change {
 }
 
 impl Change {
-    pub(super) const ALL: [(Self, &'static str); 3] = [
+    pub(crate) const ALL: [(Self, &'static str); 3] = [
         (Self::Cut, "a part of the first cut away"),
         (Self::Component, "a component more"),
         (Self::Handle, "a handle more"),
@@ -30,16 +30,16 @@ impl Change {
 
 /// Vertices, over all maps: to which nothing corresponds, of which that was said, and both; and all of them.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Masked {
-    pub(super) missing: usize,
-    pub(super) said: usize,
-    pub(super) found: usize,
-    pub(super) all: usize,
+pub(crate) struct Masked {
+    pub(crate) missing: usize,
+    pub(crate) said: usize,
+    pub(crate) found: usize,
+    pub(crate) all: usize,
 }
 
 impl Masked {
     /// Precision and recall of saying that nothing corresponds, and share of vertices of which it is said.
-    pub(super) fn figures(&self) -> [f64; 3] {
+    pub(crate) fn figures(&self) -> [f64; 3] {
         let share = |a: usize, b: usize| a as f64 / b.max(1) as f64;
         [
             share(self.found, self.said),
@@ -50,12 +50,12 @@ impl Masked {
 }
 
 /// Errors on what both shapes have, and how well it is known what one has not.
-pub(super) fn bench(
+pub(crate) fn bench(
     files: &[PathBuf],
     change: Change,
     stride: usize,
     options: &EstimateOptions,
-) -> Result<(Vec<Score>, Masked), CommandError> {
+) -> Result<(Vec<Score>, Masked), BenchError> {
     let n = files.len();
     let (mut scores, mut masked) = (Vec::new(), Masked::default());
     let pairs = (0..n).flat_map(|i| (0..n).filter(move |j| *j != i).map(move |j| (i, j)));

@@ -1,8 +1,8 @@
 //! Whether maps know where nothing corresponds: labels are carried from shapes of which a part was cut away.
 
-use super::CommandError;
-use super::bench_carry::{Labelled, Ready, labelled};
-use super::bench_labels::{Category, Known};
+use crate::carry::{Labelled, Ready, labelled};
+use crate::error::BenchError;
+use crate::stream::{Category, Known};
 use coseg::fmap::MapOptions;
 use coseg::mesh::write::off;
 use coseg::mesh::{FaceGeometry, Format, TriMesh};
@@ -19,7 +19,7 @@ const SHARE: std::ops::Range<f64> = 0.04..0.5;
 
 /// Areas, over maps from shapes with a part cut away (`cut`) and from the same shapes whole (`whole`).
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Mask {
+pub(crate) struct Mask {
     n_maps: usize,
     /// To which nothing corresponds, and it was said.
     found: f64,
@@ -32,7 +32,7 @@ pub(super) struct Mask {
 }
 
 impl Mask {
-    pub(super) fn sum(masks: &[&Self]) -> Self {
+    pub(crate) fn sum(masks: &[&Self]) -> Self {
         let add = |a: Self, b: &&Self| Self {
             n_maps: a.n_maps + b.n_maps,
             found: a.found + b.found,
@@ -53,13 +53,13 @@ impl Mask {
         ]
     }
 
-    pub(super) fn json(&self) -> Value {
+    pub(crate) fn json(&self) -> Value {
         let [missing, precision, recall, of_whole] = self.figures();
         json!({"maps": self.n_maps, "missing": missing, "precision": precision, "recall": recall,
                "said_of_whole": of_whole})
     }
 
-    pub(super) fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         let [missing, precision, recall, of_whole] = self.figures();
         format!(
             "{} maps from shapes with a part cut away, {missing:.3} of the target: nothing corresponds with precision {precision:.2}, recall {recall:.2}; said of {of_whole:.4} when nothing is cut away",
@@ -98,7 +98,7 @@ fn without_part(shape: &Known, kinds: &[i32], turn: usize) -> Option<(TriMesh, V
 }
 
 /// Maps from shapes of which one part was cut away to others that have it.
-pub(super) fn cut_away(category: &Category, prep: &Ready) -> Result<Mask, CommandError> {
+pub(crate) fn cut_away(category: &Category, prep: &Ready) -> Result<Mask, BenchError> {
     let n = category.shapes.len();
     let masks: Vec<Mask> = (0..n)
         .step_by(STRIDE)
@@ -119,7 +119,7 @@ pub(super) fn cut_away(category: &Category, prep: &Ready) -> Result<Mask, Comman
             let cut = labelled(description, &truth, &prep.kinds);
             Ok(masked(&cut, (s, class), prep, n))
         })
-        .collect::<Result<_, CommandError>>()?;
+        .collect::<Result<_, BenchError>>()?;
     Ok(Mask::sum(&masks.iter().collect::<Vec<_>>()))
 }
 

@@ -1,31 +1,17 @@
-//! `coseg bench`: how good the product is on meshes whose parts are known, and how fast.
+//! `coseg-bench labels`: accuracy on meshes whose parts are known, and the time it takes.
 
-use super::bench_labels::{Category, Run};
-use super::bench_maps::{self, BenchMaps};
-use super::bench_signatures::{self, BenchSignatures};
-use super::demo::{DRAIN_LIMIT, Scratch, log_warnings, start};
-use super::session::{Session, print_line, table};
-use super::{CommandError, Outcome, bench_labels};
-use crate::cli::{Global, up};
-use clap::{Args, Subcommand};
+use crate::error::{BenchError, Outcome};
+use crate::print::{print_line, table};
+use crate::session::{Session, log_warnings};
+use crate::stream::{Category, Run};
+use crate::{Global, stream};
+use clap::Args;
 use coseg::ipc::wire;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::time::Duration;
 
-/// `coseg bench`
-#[derive(Debug, Subcommand)]
-pub(crate) enum Bench {
-    /// Label meshes with known parts, streamed one by one, and compare
-    Labels(BenchLabels),
-    /// Map meshes with known correspondence to each other, and compare
-    Maps(BenchMaps),
-    /// Time signatures of points, beside a copy of the eigenvectors they come from
-    Signatures(BenchSignatures),
-}
-
-/// `coseg bench labels`
+/// `coseg-bench labels`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchLabels {
     /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with one integer a face
@@ -58,8 +44,6 @@ pub(crate) struct BenchLabels {
     out: Option<PathBuf>,
 }
 
-/// How long the bench waits at least for an answer of its own daemon, which shares the machine with others' work.
-const PATIENCE: Duration = Duration::from_secs(120);
 /// Shapes at the beginning and at the end of a stream whose times are compared.
 const N_TIMED: usize = 50;
 
@@ -122,15 +106,10 @@ impl Row {
     }
 }
 
-pub(crate) fn run(bench: &Bench, global: &Global) -> Outcome {
-    let args = match bench {
-        Bench::Labels(args) => args,
-        Bench::Maps(args) => return bench_maps::run(args, global),
-        Bench::Signatures(args) => return bench_signatures::run(args, global),
-    };
-    let categories = bench_labels::categories(&args.data, &args.category, args.limit)?;
+pub(crate) fn run(args: &BenchLabels, global: &Global) -> Outcome {
+    let categories = stream::categories(&args.data, &args.category, args.limit)?;
     let up = args.up.unwrap_or(wire::Up::Unknown);
-    log_warnings()?;
+    log_warnings();
     let mut rows = Vec::new();
     for category in &categories {
         rows.push(row(args, category, up, global)?);
@@ -153,40 +132,29 @@ fn row(
     category: &Category,
     up: wire::Up,
     global: &Global,
-) -> Result<Row, CommandError> {
+) -> Result<Row, BenchError> {
     let counts = exemplars(args, category)?;
     let mut runs = Vec::new();
     let mut others = Vec::new();
     for order in 0..args.orders {
-        let scratch = Scratch::create()?;
-        let running = start(&scratch.0)?;
-        let global = Global {
-            endpoint: Some(running.endpoint().to_string()),
-            timeout: global.timeout.max(PATIENCE),
-            ..global.clone()
-        };
-        let mut session = Session::open(&global)?;
+        let mut session = Session::start(global.patience())?;
         let n_parts = if args.estimate {
             0
         } else {
             category.n_parts as u32
         };
-        let run = bench_labels::stream(category, order, n_parts, up, &mut session);
-        let run = run.and_then(|mut run| {
-            run.with_exemplars = bench_labels::with_exemplars(category, &counts, &mut session)?;
-            Ok(run)
-        });
-        drop(session);
-        running.drain(DRAIN_LIMIT);
-        runs.push(run?);
+        let mut run = stream::stream(category, order, n_parts, up, &mut session)?;
+        run.with_exemplars = stream::with_exemplars(category, &counts, &mut session)?;
+        let library = session.drain();
         if order + 1 == args.orders {
             if !args.no_baselines {
-                others = bench_labels::others(category, &scratch.0.join("library"))?;
+                others = stream::others(category, &library)?;
             }
-            if let (Some(out), Some(run)) = (&args.out, runs.last()) {
-                bench_labels::write(category, run, &out.join(&category.name))?;
+            if let Some(out) = &args.out {
+                stream::write(category, &run, &out.join(&category.name))?;
             }
         }
+        runs.push(run);
     }
     Ok(Row {
         name: category.name.clone(),
@@ -204,16 +172,35 @@ fn counts(args: &BenchLabels) -> BTreeSet<usize> {
 }
 
 /// How many shapes are labelled by hand, ascending; at least one must be left over to be scored.
-fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, CommandError> {
+fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, BenchError> {
     let counts = counts(args);
     let n_shapes = category.shapes.len();
     match counts.last().filter(|n| **n >= n_shapes) {
-        Some(n) => Err(CommandError::Usage(format!(
+        Some(n) => Err(BenchError::Usage(format!(
             "--exemplars {n} leaves no shape of {} to score: it has {n_shapes}",
             category.name
         ))),
         None => Ok(counts.into_iter().collect()),
     }
+}
+
+/// The axis as `coseg add --up` takes it.
+fn up(text: &str) -> Result<wire::Up, String> {
+    Ok(match text.to_ascii_lowercase().as_str() {
+        "+x" | "x" => wire::Up::PlusX,
+        "-x" => wire::Up::MinusX,
+        "+y" | "y" => wire::Up::PlusY,
+        "-y" => wire::Up::MinusY,
+        "+z" | "z" => wire::Up::PlusZ,
+        "-z" => wire::Up::MinusZ,
+        "unknown" => wire::Up::Unknown,
+        "auto" => wire::Up::Auto,
+        _ => {
+            return Err(format!(
+                "{text:?} is none of +x -x +y -y +z -z unknown auto"
+            ));
+        }
+    })
 }
 
 fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {

@@ -1,9 +1,9 @@
-//! `coseg bench maps`: how good maps between points are on meshes whose correspondence is known.
+//! `coseg-bench maps`: how good maps between points are on meshes whose correspondence is known.
 
-use super::bench_made::{self, Change};
-use super::session::{print_line, table};
-use super::{CommandError, Outcome, bench_carry};
-use crate::cli::Global;
+use crate::error::{BenchError, Outcome};
+use crate::made::{self, Change};
+use crate::print::{print_line, table};
+use crate::{Global, carry};
 use clap::Args;
 use coseg::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
 use coseg::mesh::{self, EdgeGraph, FaceGeometry, Format, TriMesh};
@@ -19,7 +19,7 @@ const K: usize = 100;
 /// Points of each mesh at which errors are taken, spread evenly over those that are known.
 const MAX_POINTS: usize = 500;
 
-/// `coseg bench maps`
+/// `coseg-bench maps`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchMaps {
     /// Folder with folders of meshes: NAME.off, and NAME.vts, whose line i is the number, from 1, of the vertex at point i;
@@ -45,7 +45,7 @@ pub(crate) struct BenchMaps {
 }
 
 /// A mesh with its spectrum; of area 1, and with the vertices of its file.
-pub(super) struct Meshed {
+pub(crate) struct Meshed {
     vertices: Vec<[f32; 3]>,
     faces: Vec<[u32; 3]>,
     graph: EdgeGraph,
@@ -55,7 +55,7 @@ pub(super) struct Meshed {
 }
 
 /// Vertices at the known points of a mesh, and where these lie mirrored.
-pub(super) struct Known {
+pub(crate) struct Known {
     at: Vec<u32>,
     mirrored: Vec<u32>,
     /// Distances from the points at which errors are taken, with which points these are.
@@ -63,7 +63,7 @@ pub(super) struct Known {
 }
 
 /// Errors of one map, in units of the square root of the area.
-pub(super) struct Score {
+pub(crate) struct Score {
     counted: f64,
     forgiven: f64,
     expected: f64,
@@ -74,7 +74,7 @@ pub(super) struct Score {
 
 pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
     if let Some(labels) = &args.labels {
-        return bench_carry::run(labels, &args.category, global);
+        return carry::run(labels, &args.category, global);
     }
     let mut rows = Vec::new();
     let mut scores = Vec::new();
@@ -146,7 +146,7 @@ fn made(sets: &BTreeMap<String, Vec<PathBuf>>, stride: usize, global: &Global) -
     let mut lines = Vec::new();
     for (set, files) in sets {
         for (change, name) in Change::ALL {
-            let (scores, masked) = bench_made::bench(files, change, stride, &options())?;
+            let (scores, masked) = made::bench(files, change, stride, &options())?;
             lines.push((set, name, mean(&scores), masked.figures()));
         }
     }
@@ -212,10 +212,10 @@ fn calibration(scores: &mut [Score]) -> Vec<(usize, f64, f64)> {
 }
 
 /// Meshes by set, both in order.
-fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, CommandError> {
+fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, BenchError> {
     let file = |path: &Path| {
         let path = path.display().to_string();
-        move |source| CommandError::File { path, source }
+        move |source| BenchError::File { path, source }
     };
     let mut folders = vec![data.to_path_buf()];
     let mut sets: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
@@ -241,7 +241,7 @@ fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, CommandError> {
     }
     sets.values_mut().for_each(|files| files.sort());
     if sets.is_empty() {
-        return Err(CommandError::Failed(format!(
+        return Err(BenchError::Failed(format!(
             "{}: no NAME.off with NAME.vts",
             data.display()
         )));
@@ -249,27 +249,26 @@ fn sets(data: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>, CommandError> {
     Ok(sets)
 }
 
-pub(super) fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, CommandError> {
-    let text = std::fs::read_to_string(path).map_err(|source| CommandError::File {
+pub(crate) fn numbers(path: &Path, first: u32) -> Result<Vec<u32>, BenchError> {
+    let text = std::fs::read_to_string(path).map_err(|source| BenchError::File {
         path: path.display().to_string(),
         source,
     })?;
     let number = |word: &str| {
         let n = word.parse::<u32>().ok().and_then(|n| n.checked_sub(first));
-        n.ok_or_else(|| CommandError::Failed(format!("{}: {word:?} is no vertex", path.display())))
+        n.ok_or_else(|| BenchError::Failed(format!("{}: {word:?} is no vertex", path.display())))
     };
     text.split_whitespace().map(number).collect()
 }
 
-fn load(path: &Path) -> Result<Meshed, CommandError> {
-    let failed = |e: CommandError| CommandError::Failed(format!("{}: {e}", path.display()));
+fn load(path: &Path) -> Result<Meshed, BenchError> {
+    let failed = |e: BenchError| BenchError::Failed(format!("{}: {e}", path.display()));
     meshed(load_mesh(path)?).map_err(failed)
 }
 
-pub(super) fn load_mesh(path: &Path) -> Result<TriMesh, CommandError> {
-    let failed =
-        |e: &dyn std::fmt::Display| CommandError::Failed(format!("{}: {e}", path.display()));
-    let bytes = std::fs::read(path).map_err(|source| CommandError::File {
+pub(crate) fn load_mesh(path: &Path) -> Result<TriMesh, BenchError> {
+    let failed = |e: &dyn std::fmt::Display| BenchError::Failed(format!("{}: {e}", path.display()));
+    let bytes = std::fs::read(path).map_err(|source| BenchError::File {
         path: path.display().to_string(),
         source,
     })?;
@@ -281,8 +280,8 @@ pub(super) fn load_mesh(path: &Path) -> Result<TriMesh, CommandError> {
 }
 
 /// The mesh scaled to area 1, with its spectrum.
-pub(super) fn meshed(mut whole: TriMesh) -> Result<Meshed, CommandError> {
-    let failed = |e: &dyn std::fmt::Display| CommandError::Failed(e.to_string());
+pub(crate) fn meshed(mut whole: TriMesh) -> Result<Meshed, BenchError> {
+    let failed = |e: &dyn std::fmt::Display| BenchError::Failed(e.to_string());
     let area: f64 = FaceGeometry::new(&whole).areas.iter().sum();
     let scale = area.sqrt().recip();
     whole
@@ -311,7 +310,7 @@ pub(super) fn meshed(mut whole: TriMesh) -> Result<Meshed, CommandError> {
 }
 
 impl Meshed {
-    pub(super) fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
+    pub(crate) fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
         let basis = Basis {
             eigenvalues: &self.eigenvalues,
             eigenvectors: &self.eigenvectors,
@@ -322,7 +321,7 @@ impl Meshed {
     }
 
     /// Distances from points spread evenly over `at`.
-    pub(super) fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
+    pub(crate) fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
         let count = at.len().min(MAX_POINTS);
         let points = (0..count).map(|i| i * at.len() / count);
         let distances = points.map(|p| (p, self.graph.dijkstra(at[p]))).collect();
@@ -352,7 +351,7 @@ fn errors(from: &Known, to: &Known, map: &PointMap) -> (f64, f64) {
     (direct, direct.min(error(&to.mirrored)))
 }
 
-pub(super) fn scored(
+pub(crate) fn scored(
     one: (&PointShape<'_>, &Known),
     two: (&PointShape<'_>, &Known),
     options: &EstimateOptions,
@@ -382,7 +381,7 @@ fn options() -> EstimateOptions {
 }
 
 /// All ordered pairs of a set, or every so many of them.
-fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, CommandError> {
+fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, BenchError> {
     let options = options();
     let mut meshes = Vec::new();
     for file in files {
@@ -410,7 +409,7 @@ fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, CommandErro
 }
 
 /// A pair of which every vertex of the second is known on the first.
-fn bench_pair(from: &Path, to: &Path, truth: &Path) -> Result<Score, CommandError> {
+fn bench_pair(from: &Path, to: &Path, truth: &Path) -> Result<Score, BenchError> {
     let options = options();
     let (one, two) = (load(from)?, load(to)?);
     let truth = numbers(truth, 0)?;

@@ -1,0 +1,91 @@
+//! `coseg-bench`: measures labels and maps against known ones, and times the kernels.
+
+mod carry;
+mod error;
+mod labels;
+mod made;
+mod maps;
+mod partial;
+mod print;
+mod session;
+mod signatures;
+mod stream;
+
+use clap::{Args, Parser, Subcommand};
+use error::Outcome;
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// The allocator of the daemon, so that both are measured alike.
+#[global_allocator]
+static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
+
+/// Exit code of a wrong command line, as of `coseg`.
+const USAGE: u8 = 2;
+
+/// Measures how good coseg's labels and maps are, and how fast.
+#[derive(Debug, Parser)]
+#[command(name = "coseg-bench", version, arg_required_else_help = true)]
+struct Cli {
+    #[command(flatten)]
+    global: Global,
+    #[command(subcommand)]
+    bench: Bench,
+}
+
+/// Flags of every measurement.
+#[derive(Debug, Clone, Args)]
+struct Global {
+    /// Seconds to wait for an answer of the bench's own daemon; at least 120 are waited
+    #[arg(long, global = true, value_name = "SECONDS", default_value_t = 120,
+          value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    timeout: u64,
+    /// Print JSON, and nothing else, on stdout
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+impl Global {
+    /// How long an answer is waited for: other work may share the machine.
+    fn patience(&self) -> Duration {
+        Duration::from_secs(self.timeout.max(120))
+    }
+}
+
+#[derive(Debug, Subcommand)]
+enum Bench {
+    /// Label meshes with known parts, streamed one by one, and compare
+    Labels(labels::BenchLabels),
+    /// Map meshes with known correspondence to each other, and compare
+    Maps(maps::BenchMaps),
+    /// Time signatures of points, beside a copy of the eigenvectors they come from
+    Signatures(signatures::BenchSignatures),
+    /// The bench's own daemon starts this program again for each of its workers
+    #[command(hide = true)]
+    Worker,
+}
+
+fn run(cli: &Cli) -> Outcome {
+    match &cli.bench {
+        Bench::Labels(args) => labels::run(args, &cli.global),
+        Bench::Maps(args) => maps::run(args, &cli.global),
+        Bench::Signatures(args) => signatures::run(args, &cli.global),
+        Bench::Worker => unreachable!("invariant: main hands workers over before"),
+    }
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    if matches!(cli.bench, Bench::Worker) {
+        return coseg::daemon::run_worker();
+    }
+    match run(&cli) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(e) if e.is_silent() => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("coseg-bench: {e}");
+            ExitCode::from(if e.is_usage() { USAGE } else { 1 })
+        }
+    }
+}
