@@ -9,7 +9,7 @@
 
 // Geometry: one or two meshes in, values out; a crate of its own.
 pub use coseg_geometry::{
-    description, descriptors, fmap, linalg, mesh, operators, segmentation, spectrum,
+    SpectralMesh, description, descriptors, fmap, linalg, mesh, operators, segmentation, spectrum,
 };
 
 // Pure: values in, values out.

@@ -166,7 +166,7 @@ fault(
 # R6: fuzzing
 fault(
     "R6", "r6-parser-panics", "panic over a file that begins with a nul",
-    "src/mesh/parse/mod.rs", "it hostile::spoilt_meshes_and_requests_do_not_panic",
+    "crates/geometry/src/mesh/parse/mod.rs", "it hostile::spoilt_meshes_and_requests_do_not_panic",
     (
         "pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {\n",
         "pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {\n    assert!(bytes.first() != Some(&0) || !FAULT);\n",
@@ -174,7 +174,7 @@ fault(
 )
 fault(
     "R6", "r6-comments-panic", "panic over a file of comments",
-    "src/mesh/parse/mod.rs", "it hostile::the_corpus_is_parsed_or_refused_without_a_panic",
+    "crates/geometry/src/mesh/parse/mod.rs", "it hostile::the_corpus_is_parsed_or_refused_without_a_panic",
     (
         "    match format {\n",
         "    assert!(!bytes.starts_with(b\"# x\\n# x\\n\") || !FAULT);\n    match format {\n",
@@ -183,7 +183,7 @@ fault(
 # R7: hostile meshes
 fault(
     "R7", "r7-worker-aborts", "abort over a mesh without any area",
-    "src/mesh/clean.rs", "it hostile::the_corpus_through_the_socket_leaves_the_daemon_as_it_was",
+    "crates/geometry/src/mesh/clean.rs", "it hostile::the_corpus_through_the_socket_leaves_the_daemon_as_it_was",
     (
         "    if kept.is_empty() {\n",
         "    if kept.is_empty() {\n        if FAULT {\n            std::process::abort();\n        }\n",

@@ -27,6 +27,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 PLACE = ROOT / "target/faults"
 TREE = PLACE / "tree"
 TARGET = PLACE / "target"
+# Kinds of tests in faults.py by the name of their binary.
+KINDS = {"it": "it", "coseg": "lib", "coseg_geometry": "geometry"}
 # A test that hangs is red too.
 LIMIT = 240
 SWITCH = """
@@ -76,12 +78,13 @@ def plant(fault):
 
 def build():
     """The test binaries, by kind. All faults are in them, so that another choice needs no other build."""
-    lib = TREE / "src/lib.rs"
-    lib.write_text(lib.read_text() + SWITCH)
-    # Only this package quickly and roughly: the dependencies stay as they are built.
+    for lib in (TREE / "src/lib.rs", TREE / "crates/geometry/src/lib.rs"):
+        lib.write_text(lib.read_text() + SWITCH)
+    # Only these packages quickly and roughly: the dependencies stay as they are built.
     quick = "profile.release.package.coseg.opt-level=1"
     built = run(
-        [*os.environ.get("CARGO", "cargo").split(), "test", "--release", "--no-run", "--lib", "--test", "it"]
+        [*os.environ.get("CARGO", "cargo").split(), "test", "--release", "--no-run"]
+        + ["--package=coseg", "--package=coseg-geometry", "--lib", "--test", "it"]
         + ["--message-format=json", "--config", quick],
         stdout=subprocess.PIPE,
         env={**os.environ, "CARGO_TARGET_DIR": str(TARGET)},
@@ -92,7 +95,7 @@ def build():
         if message.get("message", {}).get("level") == "error":
             print(message["message"]["rendered"])
         if message.get("executable") and message.get("profile", {}).get("test"):
-            found["it" if message["target"]["name"] == "it" else "lib"] = message["executable"]
+            found[KINDS[message["target"]["name"]]] = message["executable"]
     if built.returncode:
         sys.exit("the planted tree does not build")
     return found

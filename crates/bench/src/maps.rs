@@ -5,10 +5,11 @@ use crate::made::{self, Change};
 use crate::print::{print_line, table};
 use crate::{Global, carry};
 use clap::Args;
-use coseg::fmap::{Basis, EstimateOptions, PointMap, PointShape, Side, point_maps};
-use coseg::mesh::{self, EdgeGraph, FaceGeometry, Format, TriMesh};
-use coseg::operators::{Operator, laplacian};
-use coseg::spectrum::{Options, Spectrum};
+use coseg::SpectralMesh;
+use coseg::fmap::{EstimateOptions, PointMap, PointShape, Side, point_maps};
+use coseg::mesh::{self, EdgeGraph, Format, TriMesh};
+use coseg::operators::Operator;
+use coseg::spectrum::Options;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -44,14 +45,10 @@ pub(crate) struct BenchMaps {
     made: bool,
 }
 
-/// A mesh with its spectrum; of area 1, and with the vertices of its file.
+/// A mesh with its spectrum, and the graph that measures distances on it.
 pub(crate) struct Meshed {
-    vertices: Vec<[f32; 3]>,
-    faces: Vec<[u32; 3]>,
+    spectral: SpectralMesh,
     graph: EdgeGraph,
-    eigenvalues: Vec<f64>,
-    eigenvectors: Vec<f32>,
-    mass: Vec<f32>,
 }
 
 /// Vertices at the known points of a mesh, and where these lie mirrored.
@@ -280,44 +277,18 @@ pub(crate) fn load_mesh(path: &Path) -> Result<TriMesh, BenchError> {
 }
 
 /// The mesh scaled to area 1, with its spectrum.
-pub(crate) fn meshed(mut whole: TriMesh) -> Result<Meshed, BenchError> {
-    let failed = |e: &dyn std::fmt::Display| BenchError::Failed(e.to_string());
-    let area: f64 = FaceGeometry::new(&whole).areas.iter().sum();
-    let scale = area.sqrt().recip();
-    whole
-        .vertices
-        .iter_mut()
-        .for_each(|v| *v = v.map(|x| x * scale));
-    let bridges = mesh::bridges(&whole);
-    let operator = laplacian(&whole, &bridges, Operator::Tufted).map_err(|e| failed(&e))?;
-    let k = K.min(whole.vertices.len());
-    let options = Options::default();
-    let found = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options)
-        .map_err(|e| failed(&e))?;
+pub(crate) fn meshed(whole: TriMesh) -> Result<Meshed, BenchError> {
+    let spectral = SpectralMesh::new(whole, Operator::Tufted, K, &Options::default())
+        .map_err(|e| BenchError::Failed(e.to_string()))?;
     Ok(Meshed {
-        graph: EdgeGraph::new(&whole, &bridges),
-        vertices: whole.vertices.iter().map(|v| v.map(|x| x as f32)).collect(),
-        faces: whole.faces,
-        eigenvectors: found
-            .eigenvectors
-            .transpose()
-            .iter()
-            .map(|x| *x as f32)
-            .collect(),
-        eigenvalues: found.eigenvalues,
-        mass: operator.mass.iter().map(|m| *m as f32).collect(),
+        graph: EdgeGraph::new(&spectral.mesh, &spectral.bridges),
+        spectral,
     })
 }
 
 impl Meshed {
     pub(crate) fn shape(&self, options: &EstimateOptions) -> PointShape<'_> {
-        let basis = Basis {
-            eigenvalues: &self.eigenvalues,
-            eigenvectors: &self.eigenvectors,
-            n_eigenvectors: self.eigenvalues.len(),
-            mass: &self.mass,
-        };
-        PointShape::new(&self.vertices, &self.faces, basis, options)
+        self.spectral.point_shape(options)
     }
 
     /// Distances from points spread evenly over `at`.

@@ -16,3 +16,6 @@ pub mod description;
 pub mod descriptors;
 pub mod segmentation;
 pub mod fmap;
+pub mod spectral_mesh;
+
+pub use spectral_mesh::{SpectralMesh, SpectralMeshError};

@@ -1,67 +1,8 @@
 //! Small meshes with one defect each, on which every algorithm is run.
 
-use super::{ParsedMesh, TriMesh, add, clean, scale, unit};
-use std::collections::BTreeMap;
+use super::{ParsedMesh, TriMesh, add, clean, scale};
 
-/// Unit sphere: an icosahedron, each face split in four `levels` times.
-pub(crate) fn sphere(levels: usize) -> TriMesh {
-    let t = (1.0 + 5.0_f64.sqrt()) / 2.0;
-    let mut vertices: Vec<[f64; 3]> = [
-        [-1.0, t, 0.0],
-        [1.0, t, 0.0],
-        [-1.0, -t, 0.0],
-        [1.0, -t, 0.0],
-        [0.0, -1.0, t],
-        [0.0, 1.0, t],
-        [0.0, -1.0, -t],
-        [0.0, 1.0, -t],
-        [t, 0.0, -1.0],
-        [t, 0.0, 1.0],
-        [-t, 0.0, -1.0],
-        [-t, 0.0, 1.0],
-    ]
-    .map(unit)
-    .to_vec();
-    let mut faces: Vec<[u32; 3]> = vec![
-        [0, 11, 5],
-        [0, 5, 1],
-        [0, 1, 7],
-        [0, 7, 10],
-        [0, 10, 11],
-        [1, 5, 9],
-        [5, 11, 4],
-        [11, 10, 2],
-        [10, 7, 6],
-        [7, 1, 8],
-        [3, 9, 4],
-        [3, 4, 2],
-        [3, 2, 6],
-        [3, 6, 8],
-        [3, 8, 9],
-        [4, 9, 5],
-        [2, 4, 11],
-        [6, 2, 10],
-        [8, 6, 7],
-        [9, 8, 1],
-    ];
-    for _ in 0..levels {
-        let mut middles = BTreeMap::new();
-        let mut middle = |a: u32, b: u32| {
-            *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
-                vertices.push(unit(add(vertices[a as usize], vertices[b as usize])));
-                vertices.len() as u32 - 1
-            })
-        };
-        faces = faces
-            .iter()
-            .flat_map(|&[a, b, c]| {
-                let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
-                [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
-            })
-            .collect();
-    }
-    TriMesh { vertices, faces }
-}
+pub(crate) use super::icosphere::icosphere as sphere;
 
 /// Unit cube, two triangles a side.
 pub(crate) fn cube() -> TriMesh {

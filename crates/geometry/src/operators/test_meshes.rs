@@ -1,69 +1,8 @@
 //! Small meshes with known properties.
 
 use crate::mesh::TriMesh;
+pub(crate) use crate::mesh::icosphere;
 use std::collections::HashMap;
-
-/// A sphere of radius 1 with `10 · 4^level + 2` vertices.
-pub(crate) fn icosphere(level: u32) -> TriMesh {
-    let t = (1.0 + 5.0f64.sqrt()) / 2.0;
-    let mut vertices: Vec<[f64; 3]> = vec![
-        [-1.0, t, 0.0],
-        [1.0, t, 0.0],
-        [-1.0, -t, 0.0],
-        [1.0, -t, 0.0],
-        [0.0, -1.0, t],
-        [0.0, 1.0, t],
-        [0.0, -1.0, -t],
-        [0.0, 1.0, -t],
-        [t, 0.0, -1.0],
-        [t, 0.0, 1.0],
-        [-t, 0.0, -1.0],
-        [-t, 0.0, 1.0],
-    ];
-    let mut faces: Vec<[u32; 3]> = vec![
-        [0, 11, 5],
-        [0, 5, 1],
-        [0, 1, 7],
-        [0, 7, 10],
-        [0, 10, 11],
-        [1, 5, 9],
-        [5, 11, 4],
-        [11, 10, 2],
-        [10, 7, 6],
-        [7, 1, 8],
-        [3, 9, 4],
-        [3, 4, 2],
-        [3, 2, 6],
-        [3, 6, 8],
-        [3, 8, 9],
-        [4, 9, 5],
-        [2, 4, 11],
-        [6, 2, 10],
-        [8, 6, 7],
-        [9, 8, 1],
-    ];
-    for _ in 0..level {
-        let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
-        let mut middle = |a: u32, b: u32| {
-            *middles.entry([a.min(b), a.max(b)]).or_insert_with(|| {
-                let (p, q) = (vertices[a as usize], vertices[b as usize]);
-                vertices.push(std::array::from_fn(|d| 0.5 * (p[d] + q[d])));
-                vertices.len() as u32 - 1
-            })
-        };
-        let mut finer = Vec::with_capacity(4 * faces.len());
-        for [a, b, c] in faces {
-            let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
-            finer.extend([[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]);
-        }
-        faces = finer;
-    }
-    for p in &mut vertices {
-        let r = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt();
-        *p = p.map(|x| x / r);
-    }
-    TriMesh { vertices, faces }
-}
 
 /// A `width × height` rectangle of `(nx + 1) (ny + 1)` vertices; the diagonals alternate.
 pub(crate) fn rectangle(width: f64, height: f64, nx: u32, ny: u32) -> TriMesh {
