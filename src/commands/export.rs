@@ -1,6 +1,6 @@
 //! `coseg export`: labels, or coloured meshes, of a collection become files.
 
-use super::export_mesh::{colour, material, materials, polygons};
+use super::export_mesh::{colour, material, materials};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
@@ -112,7 +112,7 @@ fn with_mesh(
     labels: &[i32],
     infos: &[wire::LabelInfo],
 ) -> (String, Vec<u8>) {
-    let (vertices, polygons) = (&mesh.vertices, polygons(mesh));
+    let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
     let name = |label| material(label, infos);
     let named = |label| (material(label, infos), colour(label, infos));
     match format {

@@ -95,6 +95,11 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
             ("non-manifold edges", r.n_nonmanifold_edges),
             ("boundary edges", r.n_boundary_edges),
             ("virtual edges between components", r.n_bridges),
+            ("concave polygons", r.n_concave_polygons),
+            ("polygons not planar", r.n_nonplanar_polygons),
+            ("polygons that cross themselves or have no area", r.n_nonsimple_polygons),
+            ("statements that programs differ about read", r.n_tolerated_statements),
+            ("other statements not read", r.n_unread_statements),
         ];
         let found: Vec<String> = counts
             .iter()

@@ -22,6 +22,11 @@ fn report(r: &CleanReport) -> wire::CleanReport {
         n_proxy_vertices: r.n_proxy_vertices as u64,
         n_bridges: r.n_bridges as u64,
         n_flipped_triangles: r.n_flipped_triangles as u64,
+        n_concave_polygons: r.n_concave_polygons as u64,
+        n_nonplanar_polygons: r.n_nonplanar_polygons as u64,
+        n_nonsimple_polygons: r.n_nonsimple_polygons as u64,
+        n_tolerated_statements: r.n_tolerated_statements as u64,
+        n_unread_statements: r.n_unread_statements as u64,
     }
 }
 
