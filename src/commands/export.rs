@@ -164,7 +164,10 @@ pub(super) fn original(
     let mesh = parse(bytes, format).map_err(|e| bad(format!("{shape}: {e}")))?;
     if mesh.n_polygons != n_labels {
         let n = mesh.n_polygons;
-        return Err(bad(format!("{shape} has {n} faces, but {n_labels} labels")));
+        return Err(bad(format!(
+            "{shape} has {n} faces, but {n_labels} labels, by an earlier release: add it again with \
+             --replace"
+        )));
     }
     Ok(mesh)
 }

@@ -10,7 +10,11 @@ const POINTER: &str = "get the file itself with `git lfs pull`";
 
 /// Beginnings of files that are no meshes, or meshes of formats that are not supported.
 const BEGINNINGS: [(&[u8], &str, &str); 34] = [
-    (b"PK\x03\x04", "a ZIP archive (or a 3MF, USDZ or office file)", UNPACK),
+    (
+        b"PK\x03\x04",
+        "a ZIP archive (or a 3MF, USDZ or office file)",
+        UNPACK,
+    ),
     (b"PK\x05\x06", "an empty ZIP archive", UNPACK),
     (b"\x1f\x8b", "a gzip file", UNPACK),
     (b"BZh", "a bzip2 file", UNPACK),
@@ -28,7 +32,11 @@ const BEGINNINGS: [(&[u8], &str, &str); 34] = [
     (b"#?RADIANCE", "a Radiance picture", NO_MESH),
     (b"8BPS", "a Photoshop picture", NO_MESH),
     (b"DDS ", "a DDS picture", NO_MESH),
-    (b"RIFF", "a RIFF file (a WebP picture, a sound or a film)", NO_MESH),
+    (
+        b"RIFF",
+        "a RIFF file (a WebP picture, a sound or a film)",
+        NO_MESH,
+    ),
     (b"%PDF-", "a PDF document", NO_MESH),
     (b"%!PS", "a PostScript document", NO_MESH),
     (b"\x93NUMPY", "a NumPy array", NO_MESH),
@@ -48,7 +56,9 @@ const BEGINNINGS: [(&[u8], &str, &str); 34] = [
 
 /// That a file is something else than its name says, if its first bytes show what.
 pub(super) fn of(bytes: &[u8], wanted: Format) -> Option<ParseError> {
-    let found = BEGINNINGS.iter().find(|(begin, ..)| bytes.starts_with(begin));
+    let found = BEGINNINGS
+        .iter()
+        .find(|(begin, ..)| bytes.starts_with(begin));
     let (found, instead) = match found {
         Some(&(_, found, instead)) => (found, instead_of(instead)),
         None => {
@@ -143,7 +153,10 @@ mod tests {
             let bytes = [begin, b"\x00\x01 and more\n\x02"].concat();
             for format in Format::ALL {
                 let message = message(&bytes, format);
-                assert!(message.starts_with(&format!("the file is {found}, not ")), "{message}");
+                assert!(
+                    message.starts_with(&format!("the file is {found}, not ")),
+                    "{message}"
+                );
             }
         }
         assert_eq!(
@@ -152,7 +165,10 @@ mod tests {
              the mesh that is in it, as one of .obj, .off, .ply, .stl, .glb, .gltf"
         );
         assert_eq!(
-            message(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", Format::Obj),
+            message(
+                b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+                Format::Obj
+            ),
             "the file is a Git LFS pointer, not an OBJ mesh: get the file itself with `git lfs pull`"
         );
         assert_eq!(
@@ -166,7 +182,10 @@ mod tests {
             (b"\x01\x02\x03\x04", "binary data of an unknown kind"),
         ] {
             let message = message(bytes, Format::Off);
-            assert!(message.contains(&format!(" is {found}, not an OFF mesh")), "{message}");
+            assert!(
+                message.contains(&format!(" is {found}, not an OFF mesh")),
+                "{message}"
+            );
         }
     }
 

@@ -44,7 +44,11 @@ fn unmarked(bytes: &[u8]) -> Option<Order> {
     let begin = &pairs[..pairs.len().min(N_PAIRS)];
     let text = |b: u8| matches!(b, b'\t' | b'\n' | b'\r' | b' '..=b'~');
     let all = |of: fn(&[u8; 2]) -> (u8, u8)| {
-        begin.len() > 1 && begin.iter().map(of).all(|(low, high)| text(low) && high == 0)
+        begin.len() > 1
+            && begin
+                .iter()
+                .map(of)
+                .all(|(low, high)| text(low) && high == 0)
     };
     match (all(|p| (p[0], p[1])), all(|p| (p[1], p[0]))) {
         (true, _) => Some(Order::Little),
@@ -68,7 +72,11 @@ fn from_utf_32(bytes: &[u8], unit: fn([u8; 4]) -> u32) -> Vec<u8> {
     let (fours, _) = bytes.as_chunks::<4>();
     let mut text = String::with_capacity(fours.len());
     let character = |&four: &[u8; 4]| char::from_u32(unit(four));
-    text.extend(fours.iter().map(|f| character(f).unwrap_or(char::REPLACEMENT_CHARACTER)));
+    text.extend(
+        fours
+            .iter()
+            .map(|f| character(f).unwrap_or(char::REPLACEMENT_CHARACTER)),
+    );
     text.into_bytes()
 }
 
@@ -82,8 +90,14 @@ mod tests {
     fn a_text_is_the_same_in_every_encoding() {
         let little: Vec<u8> = TEXT.encode_utf16().flat_map(u16::to_le_bytes).collect();
         let big: Vec<u8> = TEXT.encode_utf16().flat_map(u16::to_be_bytes).collect();
-        let four: Vec<u8> = TEXT.chars().flat_map(|c| u32::from(c).to_le_bytes()).collect();
-        let four_big: Vec<u8> = TEXT.chars().flat_map(|c| u32::from(c).to_be_bytes()).collect();
+        let four: Vec<u8> = TEXT
+            .chars()
+            .flat_map(|c| u32::from(c).to_le_bytes())
+            .collect();
+        let four_big: Vec<u8> = TEXT
+            .chars()
+            .flat_map(|c| u32::from(c).to_be_bytes())
+            .collect();
         for bytes in [
             TEXT.as_bytes().to_vec(),
             [b"\xef\xbb\xbf", TEXT.as_bytes()].concat(),
@@ -100,7 +114,14 @@ mod tests {
 
     #[test]
     fn what_is_no_unicode_stays_as_it_is() {
-        for bytes in [&b""[..], b"v", b"v\0", b"glTF\x02\0\0\0", b"\0\0\0\0", b"# Gr\xf6\xdfe\n"] {
+        for bytes in [
+            &b""[..],
+            b"v",
+            b"v\0",
+            b"glTF\x02\0\0\0",
+            b"\0\0\0\0",
+            b"# Gr\xf6\xdfe\n",
+        ] {
             assert_eq!(as_utf8(bytes), bytes);
         }
         // Half a character at the end, and half of a pair.

@@ -183,10 +183,12 @@ impl Polygons {
         if triangles.len() + n_triangles > MAX_TRIANGLES {
             return Err(ParseError::TooManyTriangles);
         }
-        let kind = self.triangulator.triangulate(vertices, corners, |triangle| {
-            triangles.push(triangle);
-            polygon_of_triangle.push(face as u32);
-        });
+        let kind = self
+            .triangulator
+            .triangulate(vertices, corners, |triangle| {
+                triangles.push(triangle);
+                polygon_of_triangle.push(face as u32);
+            });
         findings.n_nonplanar_polygons += usize::from(!kind.planar);
         findings.n_nonsimple_polygons += usize::from(!kind.simple);
         if !kind.fan {

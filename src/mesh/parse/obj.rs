@@ -29,10 +29,43 @@ const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
 /// Statements without a surface of their own: attributes of vertices, groups, states, and what belongs to a
 /// curve or surface that is counted by itself.
 const WITHOUT_SURFACE: [&[u8]; 37] = [
-    b"vt", b"vn", b"vp", b"g", b"s", b"o", b"mg", b"usemtl", b"mtllib", b"usemap", b"maplib", b"bevel",
-    b"c_interp", b"d_interp", b"lod", b"shadow_obj", b"trace_obj", b"ctech", b"stech", b"deg", b"bmat",
-    b"step", b"cstype", b"parm", b"trim", b"hole", b"scrv", b"sp", b"end", b"con", b"res", b"vc", b"vw",
-    b"cstyle", b"texture", b"xf", b"matlib",
+    b"vt",
+    b"vn",
+    b"vp",
+    b"g",
+    b"s",
+    b"o",
+    b"mg",
+    b"usemtl",
+    b"mtllib",
+    b"usemap",
+    b"maplib",
+    b"bevel",
+    b"c_interp",
+    b"d_interp",
+    b"lod",
+    b"shadow_obj",
+    b"trace_obj",
+    b"ctech",
+    b"stech",
+    b"deg",
+    b"bmat",
+    b"step",
+    b"cstype",
+    b"parm",
+    b"trim",
+    b"hole",
+    b"scrv",
+    b"sp",
+    b"end",
+    b"con",
+    b"res",
+    b"vc",
+    b"vw",
+    b"cstyle",
+    b"texture",
+    b"xf",
+    b"matlib",
 ];
 
 /// The geometry of a file, as lines for `tobj`.
@@ -89,7 +122,11 @@ impl Geometry {
                     found += 1;
                 }
                 if found < 3 {
-                    return Err(ParseError::ShortVertex { line, found, needed: 3 });
+                    return Err(ParseError::ShortVertex {
+                        line,
+                        found,
+                        needed: 3,
+                    });
                 }
                 self.n_vertices += 1;
             }

@@ -55,7 +55,10 @@ fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseErro
     };
     // Some writers leave out the line end: `OFF490 518 0`.
     let glued = Some(&first[at + 3..]).filter(|glued| !glued.is_empty());
-    let rest: Vec<&[u8]> = glued.into_iter().chain(words[1..].iter().copied()).collect();
+    let rest: Vec<&[u8]> = glued
+        .into_iter()
+        .chain(words[1..].iter().copied())
+        .collect();
     if rest
         .first()
         .is_some_and(|w| w.eq_ignore_ascii_case(b"BINARY"))
@@ -142,7 +145,11 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         let mut position = position(line, &mut words)?;
         if homogeneous {
             let word = words.next();
-            let word = word.ok_or(ParseError::ShortVertex { line, found: 3, needed: 4 })?;
+            let word = word.ok_or(ParseError::ShortVertex {
+                line,
+                found: 3,
+                needed: 4,
+            })?;
             let w: f64 = number(line, word)?;
             position = position.map(|x| x / w);
         }

@@ -324,7 +324,9 @@ fn text_stl_may_have_several_statements_on_a_line() {
     assert_eq!(mesh.findings.n_unread_statements, 1);
     // Words that are no statement begin a line: which of them are geometry nobody knows.
     assert_eq!(
-        stl(text.replacen("endfacet", "end facet", 1).as_bytes()).unwrap_err().to_string(),
+        stl(text.replacen("endfacet", "end facet", 1).as_bytes())
+            .unwrap_err()
+            .to_string(),
         "line 8: \"end facet\" is no line of a text STL"
     );
 }

@@ -118,12 +118,7 @@ impl Text {
     }
 
     /// Reads the statement that begins at a word, and says how many words it has.
-    fn statement(
-        &mut self,
-        line: usize,
-        words: &[&[u8]],
-        at: usize,
-    ) -> Result<usize, ParseError> {
+    fn statement(&mut self, line: usize, words: &[&[u8]], at: usize) -> Result<usize, ParseError> {
         let polygons = &mut self.polygons;
         let n_vertices = polygons.mesh.vertices.len();
         let face = polygons.mesh.n_polygons;

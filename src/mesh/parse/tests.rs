@@ -162,14 +162,20 @@ fn off_headers_in_all_their_spellings() {
     let homogeneous = "N4OFF\n4 2 0\n0 0 0 1 0 0 1\n2 0 0 2 0 0 1\n-1 -1 0 -1 0 0 1\n0 .5 0 .5\n\
                        4 0 1 2 3\n3 0 1 2\n";
     assert_eq!(off(homogeneous).unwrap(), plain);
-    assert_eq!(off(&homogeneous.replace("N4OFF", "4nOFF 3")).unwrap(), plain);
+    assert_eq!(
+        off(&homogeneous.replace("N4OFF", "4nOFF 3")).unwrap(),
+        plain
+    );
 }
 
 #[test]
 fn off_errors_name_the_place_and_the_value() {
     for (text, message) in [
         ("", "the file is empty"),
-        ("\n", "the file begins with \"\", which is not an OFF header"),
+        (
+            "\n",
+            "the file begins with \"\", which is not an OFF header",
+        ),
         (
             "ply\n",
             "the file is a PLY mesh, not an OFF mesh: name it .ply",
@@ -178,10 +184,7 @@ fn off_errors_name_the_place_and_the_value() {
             "XOFF\n1 1 0\n",
             "the file begins with \"XOFF\", which is not an OFF header",
         ),
-        (
-            "OFF BINARY\n",
-            "binary OFF is not read, save it as text",
-        ),
+        ("OFF BINARY\n", "binary OFF is not read, save it as text"),
         (
             "CCOFF\n1 1 0\n",
             "the file begins with \"CCOFF\", which is not an OFF header",
@@ -305,9 +308,18 @@ fn texts_are_read_in_every_encoding_and_with_every_line_end() {
             let (little, big) = (wide(u16::to_le_bytes), wide(u16::to_be_bytes));
             for (name, bytes) in [
                 ("UTF-8", text.as_bytes().to_vec()),
-                ("a byte-order mark", [b"\xef\xbb\xbf", text.as_bytes()].concat()),
-                ("UTF-16LE with a mark", [b"\xff\xfe", little.as_slice()].concat()),
-                ("UTF-16BE with a mark", [b"\xfe\xff", big.as_slice()].concat()),
+                (
+                    "a byte-order mark",
+                    [b"\xef\xbb\xbf", text.as_bytes()].concat(),
+                ),
+                (
+                    "UTF-16LE with a mark",
+                    [b"\xff\xfe", little.as_slice()].concat(),
+                ),
+                (
+                    "UTF-16BE with a mark",
+                    [b"\xfe\xff", big.as_slice()].concat(),
+                ),
                 ("UTF-16LE", little),
                 ("UTF-16BE", big),
             ] {
@@ -336,8 +348,13 @@ fn c_prism(start: usize) -> String {
 }
 
 fn area(mesh: &ParsedMesh) -> f64 {
-    let corners = mesh.triangles.iter().map(|t| t.map(|v| mesh.vertices[v as usize]));
-    corners.map(|[a, b, c]| 0.5 * norm(cross(sub(b, a), sub(c, a)))).sum()
+    let corners = mesh
+        .triangles
+        .iter()
+        .map(|t| t.map(|v| mesh.vertices[v as usize]));
+    corners
+        .map(|[a, b, c]| 0.5 * norm(cross(sub(b, a), sub(c, a))))
+        .sum()
 }
 
 #[test]
@@ -363,10 +380,23 @@ fn concave_faces_have_the_area_they_have_in_every_format_and_in_exports() {
         assert_eq!(obj(&text).unwrap(), mesh);
         let lines: String = polygons
             .iter()
-            .map(|p| format!("{} {}\n", p.len(), p.iter().map(u32::to_string).collect::<Vec<_>>().join(" ")))
+            .map(|p| {
+                format!(
+                    "{} {}\n",
+                    p.len(),
+                    p.iter().map(u32::to_string).collect::<Vec<_>>().join(" ")
+                )
+            })
             .collect();
-        let vertices: String = mesh.vertices.iter().map(|[x, y, z]| format!("{x} {y} {z}\n")).collect();
-        assert_eq!(off(&format!("OFF\n16 10 0\n{vertices}{lines}")).unwrap(), mesh);
+        let vertices: String = mesh
+            .vertices
+            .iter()
+            .map(|[x, y, z]| format!("{x} {y} {z}\n"))
+            .collect();
+        assert_eq!(
+            off(&format!("OFF\n16 10 0\n{vertices}{lines}")).unwrap(),
+            mesh
+        );
     }
 }
 
@@ -377,5 +407,15 @@ fn faces_that_are_not_planar_or_cross_themselves_are_counted() {
     assert_eq!(mesh.findings.n_nonplanar_polygons, 1);
     assert_eq!(mesh.findings.n_nonsimple_polygons, 1);
     // Each is its fan, as before it was counted.
-    assert_eq!(mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 1, 4], [0, 4, 3], [0, 4, 1], [0, 1, 3]]);
+    assert_eq!(
+        mesh.triangles,
+        [
+            [0, 1, 2],
+            [0, 2, 3],
+            [0, 1, 4],
+            [0, 4, 3],
+            [0, 4, 1],
+            [0, 1, 3]
+        ]
+    );
 }

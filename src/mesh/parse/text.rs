@@ -88,9 +88,11 @@ pub(super) fn position<'a>(
 ) -> Result<[f64; 3], ParseError> {
     let mut position = [0.0; 3];
     for (found, x) in position.iter_mut().enumerate() {
-        let word = words
-            .next()
-            .ok_or(ParseError::ShortVertex { line, found, needed: 3 })?;
+        let word = words.next().ok_or(ParseError::ShortVertex {
+            line,
+            found,
+            needed: 3,
+        })?;
         *x = number(line, word)?;
     }
     Ok(position)

@@ -121,7 +121,13 @@ impl Triangulator {
         }
         let normal = normal.map(|x| x / doubled);
         // The axis that is farthest from the normal, so that planes along axes are projected exactly.
-        let least = (0..3).fold(0, |l, i| if normal[i].abs() < normal[l].abs() { i } else { l });
+        let least = (0..3).fold(0, |l, i| {
+            if normal[i].abs() < normal[l].abs() {
+                i
+            } else {
+                l
+            }
+        });
         let mut axis = [0.0; 3];
         axis[least] = 1.0;
         let v = cross(normal, axis);
@@ -130,8 +136,11 @@ impl Triangulator {
         let u = cross(v, normal);
         self.flat.clear();
         // Adding zero makes -0 and 0 one.
-        self.flat
-            .extend(self.local.iter().map(|&p| [dot(p, u) + 0.0, dot(p, v) + 0.0]));
+        self.flat.extend(
+            self.local
+                .iter()
+                .map(|&p| [dot(p, u) + 0.0, dot(p, v) + 0.0]),
+        );
         let extent = |values: &mut dyn Iterator<Item = f64>| {
             let ends = |(low, high): (f64, f64), x: f64| (low.min(x), high.max(x));
             let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), ends);
@@ -237,7 +246,13 @@ fn points(
     let mut corner_of: Vec<usize> = Vec::with_capacity(n);
     for (corner, p) in flat.iter().enumerate() {
         // Below this a coordinate has no digits left in predicates; the unit is the size of the polygon.
-        let [x, y] = p.map(|x| if x.abs() < spade::MIN_ALLOWED_VALUE { 0.0 } else { x });
+        let [x, y] = p.map(|x| {
+            if x.abs() < spade::MIN_ALLOWED_VALUE {
+                0.0
+            } else {
+                x
+            }
+        });
         let point = Point2::new(x, y);
         let handle = match ring.last() {
             Some(&near) => plane.insert_with_hint(point, near).ok()?,

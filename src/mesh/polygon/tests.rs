@@ -83,7 +83,10 @@ fn check(vertices: &[[f64; 3]], start: usize, wanted_area: f64) -> Result<(), St
         .map(|edge| edge.map(at));
     let of_polygon = (0..n).map(|i| [vertices[i], vertices[(i + 1) % n]]);
     let faults = [
-        ((found - wanted_area).abs() > EXACT * wanted_area, "the area"),
+        (
+            (found - wanted_area).abs() > EXACT * wanted_area,
+            "the area",
+        ),
         (triangles.len() != n - 2, "the number of triangles"),
         (!kind.simple || !kind.planar, "the kind"),
         (border(of_triangles) != border(of_polygon), "the border"),
@@ -178,7 +181,10 @@ fn a_polygon_is_covered_whatever_its_first_corner_and_its_plane() {
     check_all("a comb", &comb(5));
     check_all("a star", &star(5));
     check_all("a spiral", &spiral(20));
-    check_all("an arrow", &[[0.0, 0.0], [4.0, -1.0], [1.0, 0.0], [4.0, 1.0]]);
+    check_all(
+        "an arrow",
+        &[[0.0, 0.0], [4.0, -1.0], [1.0, 0.0], [4.0, 1.0]],
+    );
     // A window in a wall: its corners are shared by the bridge.
     let window = [
         [0.0, 0.0],
@@ -238,7 +244,14 @@ fn a_convex_polygon_has_its_fan() {
         assert_eq!(of_vertices(&behind, 0).0, fan);
     }
     // Corners on a line, and one twice, as cleaning expects them.
-    let bent = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 1.0]];
+    let bent = [
+        [0.0, 0.0],
+        [1.0, 0.0],
+        [2.0, 0.0],
+        [2.0, 0.0],
+        [2.0, 2.0],
+        [0.0, 1.0],
+    ];
     let (triangles, kind) = triangulated(&bent, 0);
     assert_eq!(triangles, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]);
     assert!(kind.fan && kind.simple);
@@ -268,17 +281,27 @@ fn a_keyhole_polygon_is_one_piece() {
     let polygon = keyhole();
     let mut reversed = polygon.clone();
     reversed.reverse();
-    let polygon = if shoelace(&polygon) > 0.0 { polygon } else { reversed };
+    let polygon = if shoelace(&polygon) > 0.0 {
+        polygon
+    } else {
+        reversed
+    };
     for start in 0..polygon.len() {
         let (triangles, kind) = triangulated(&polygon, start);
         assert!(kind.simple, "{start}");
         let found = area(&lifted(&polygon), &triangles);
-        assert!((found - shoelace(&polygon)).abs() < EXACT, "{start}: {found}");
+        assert!(
+            (found - shoelace(&polygon)).abs() < EXACT,
+            "{start}: {found}"
+        );
         // One piece: every triangle is reached over edges.
         let mut reached = vec![false; triangles.len()];
         let place = |v: u32| polygon[v as usize].map(f64::to_bits);
         let shared = |a: [u32; 3], b: [u32; 3]| {
-            a.iter().filter(|v| b.iter().any(|w| place(**v) == place(*w))).count() == 2
+            a.iter()
+                .filter(|v| b.iter().any(|w| place(**v) == place(*w)))
+                .count()
+                == 2
         };
         let mut todo = vec![0];
         while let Some(t) = todo.pop() {
@@ -299,13 +322,25 @@ fn what_is_no_simple_polygon_keeps_its_fan_and_is_reported() {
         .map(|a| [a.cos(), a.sin()])
         .collect();
     for (name, polygon) in [
-        ("a bow-tie", vec![[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 1.0]]),
-        ("an even bow-tie", vec![[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]),
-        ("on a line", vec![[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]),
+        (
+            "a bow-tie",
+            vec![[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 1.0]],
+        ),
+        (
+            "an even bow-tie",
+            vec![[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]],
+        ),
+        (
+            "on a line",
+            vec![[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [3.0, 3.0]],
+        ),
         ("in a point", vec![[5.0, 5.0]; 6]),
         ("twice around", around_twice),
         ("a pentagram", pentagram),
-        ("there and back", vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 0.0]]),
+        (
+            "there and back",
+            vec![[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 0.0]],
+        ),
     ] {
         let fan: Vec<[u32; 3]> = (2..polygon.len() as u32).map(|i| [0, i - 1, i]).collect();
         let (triangles, kind) = triangulated(&polygon, 0);
@@ -368,7 +403,12 @@ fn cross_each_other(polygon: &[[f64; 2]]) -> bool {
         (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
     };
     let meet = |i: usize, j: usize| {
-        let (a, b, c, d) = (polygon[i], polygon[(i + 1) % n], polygon[j], polygon[(j + 1) % n]);
+        let (a, b, c, d) = (
+            polygon[i],
+            polygon[(i + 1) % n],
+            polygon[j],
+            polygon[(j + 1) % n],
+        );
         side(a, b, c) * side(a, b, d) <= 0.0 && side(c, d, a) * side(c, d, b) <= 0.0
     };
     (0..n).any(|i| (i + 2..n).any(|j| (j + 1) % n != i && meet(i, j)))
@@ -381,7 +421,10 @@ fn simple_polygon() -> impl Strategy<Value = Vec<[f64; 2]>> {
         let mut polygon: Vec<[f64; 2]> = vec![[-100.0, -200.0], [1400.0, 30.0], [200.0, 1300.0]];
         for (x, y, edge) in points {
             let mut longer = polygon.clone();
-            longer.insert(1 + usize::from(edge) % polygon.len(), [f64::from(x), f64::from(y)]);
+            longer.insert(
+                1 + usize::from(edge) % polygon.len(),
+                [f64::from(x), f64::from(y)],
+            );
             if !cross_each_other(&longer) && shoelace(&longer) > 1.0 {
                 polygon = longer;
             }
