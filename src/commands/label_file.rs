@@ -1,4 +1,5 @@
-//! A file of labels becomes a label for each face: text with one a line, NumPy, or what `coseg export` writes.
+//! A file of labels becomes a label for each face: text with one a line, NumPy, or what `coseg
+//! export` writes.
 
 use super::CommandError;
 use super::npy::{self, Elements};

@@ -194,10 +194,10 @@ impl Library {
         self.object_length(&self.item_row(item)?.item.original_digest)
     }
 
-    /// Whether placing an item would need its description now: not when the same bytes are there under its
-    /// name, or others that it may not replace. Either may change until the items before it are placed. Bytes that
-    /// the first release read are described again when they are to replace themselves: it may have read them in
-    /// another way.
+    /// Whether placing an item would need its description now: not when the same bytes are there
+    /// under its name, or others that it may not replace. Either may change until the items before
+    /// it are placed. Bytes that the first release read are described again when they are to
+    /// replace themselves: it may have read them in another way.
     ///
     /// # Errors
     /// There is no such item or collection, or the catalog cannot be read.
@@ -500,8 +500,9 @@ pub(super) fn unix_secs() -> u64 {
         .map_or(0, |d| d.as_secs())
 }
 
-/// What decides the bits of a description besides bytes and parameters: the algorithm, the instruction set that
-/// the kernels choose at run time, and, where it matters, how the bytes are read.
+/// What decides the bits of a description besides bytes and parameters: the algorithm, the
+/// instruction set that the kernels choose at run time, and, where it matters, how the bytes are
+/// read.
 pub(super) fn algorithm(report: &CleanReport) -> String {
     let algorithm = format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new());
     match report.differs_from_first_release() {

@@ -113,7 +113,8 @@ pub struct ParsedMesh {
     pub polygon_of_triangle: Vec<u32>,
     /// Number of polygons (faces) in the file.
     pub n_polygons: usize,
-    /// Corners of each polygon whose triangles are not its fan from the first corner, by polygon, ascending.
+    /// Corners of each polygon whose triangles are not its fan from the first corner, by polygon,
+    /// ascending.
     pub not_fans: Vec<(u32, Vec<u32>)>,
     /// What reading found.
     pub findings: Findings,
@@ -193,7 +194,8 @@ pub struct CleanReport {
     pub n_proxy_vertices: usize,
     /// Bridges put between components of the proxy.
     pub n_bridges: usize,
-    /// Polygons whose triangles are not their fan from the first corner: concave ones, and those with holes.
+    /// Polygons whose triangles are not their fan from the first corner: concave ones, and those
+    /// with holes.
     pub n_concave_polygons: usize,
     /// Polygons whose corners do not lie in a plane.
     pub n_nonplanar_polygons: usize,

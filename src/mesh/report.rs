@@ -11,8 +11,9 @@ macro_rules! counts {
                 vec![$((stringify!($name), $name),)+ $((stringify!($later), $later)),+]
             }
 
-            /// The report whose counts `count` gives by name; its first error is returned, and that of `missing`
-            /// for a count that is not there. Reports of the first release lack the later counts: those are 0.
+            /// The report whose counts `count` gives by name; its first error is returned, and that
+            /// of `missing` for a count that is not there. Reports of the first release lack the
+            /// later counts: those are 0.
             pub fn from_counts<E>(
                 count: impl Fn(&'static str) -> Result<Option<usize>, E>,
                 missing: impl Fn(&'static str) -> E,
@@ -49,8 +50,8 @@ counts!(
 );
 
 impl CleanReport {
-    /// Whether the first release read the same bytes as other triangles: it took the fan of every polygon, and
-    /// dropped words that are read now.
+    /// Whether the first release read the same bytes as other triangles: it took the fan of every
+    /// polygon, and dropped words that are read now.
     pub fn differs_from_first_release(&self) -> bool {
         self.n_concave_polygons + self.n_tolerated_statements > 0
     }

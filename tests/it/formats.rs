@@ -289,7 +289,8 @@ fn a_made_shape_reads_the_same_in_every_format() {
     assert_eq!(labels_of_glb(&glb, &found, &off), labels);
 }
 
-/// A prism over a C; the caps begin at a corner whose fan leaves them. By hand: 2 x 7 for the caps, 16 for the walls.
+/// A prism over a C; the caps begin at a corner whose fan leaves them. By hand: 2 x 7 for the caps,
+/// 16 for the walls.
 fn concave_prism() -> String {
     let c = ["0 0", "3 0", "3 1", "1 1", "1 2", "3 2", "3 3", "0 3"];
     let mut text = String::new();

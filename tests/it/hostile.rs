@@ -222,7 +222,8 @@ pub(crate) fn corpus() -> Vec<Hostile> {
         let _ = writeln!(text, "{n} {}", corners.join(" "));
         off(&format!("a polygon that is {name}"), text);
     };
-    // As many corners as are read, in the orders that are the slowest for some way of triangulating.
+    // As many corners as are read, in the orders that are the slowest for some way of
+    // triangulating.
     let circle = |i: usize, radius: f64| {
         let a = i as f64 * 6.283_185e-4;
         [radius * a.cos(), radius * a.sin()]

@@ -1,5 +1,5 @@
-//! The first bytes of a file that cannot be read say what it is: an archive, a picture, a mesh of another
-//! format, or a pointer to a file that was not fetched.
+//! The first bytes of a file that cannot be read say what it is: an archive, a picture, a mesh of
+//! another format, or a pointer to a file that was not fetched.
 
 use super::{Format, ParseError, as_utf8};
 

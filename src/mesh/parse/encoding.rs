@@ -1,8 +1,9 @@
-//! Bytes of a text in any Unicode encoding become the same text in UTF-8, without a byte-order mark.
+//! Bytes of a text in any Unicode encoding become the same text in UTF-8, without a byte-order
+//! mark.
 //!
-//! UTF-16 and UTF-32 are told by their byte-order marks, UTF-16 also by its zeros: programs that save
-//! "Unicode" write it without a mark, too. Every other text is left as it is: keywords and numbers are the
-//! same bytes in UTF-8, Latin-1 and all that extend ASCII, and names are not read.
+//! UTF-16 and UTF-32 are told by their byte-order marks, UTF-16 also by its zeros: programs that
+//! save "Unicode" write it without a mark, too. Every other text is left as it is: keywords and
+//! numbers are the same bytes in UTF-8, Latin-1 and all that extend ASCII, and names are not read.
 
 use std::borrow::Cow;
 

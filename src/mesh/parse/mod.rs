@@ -1,8 +1,8 @@
 //! Bytes of a mesh file become triangulated polygons, in file order.
 //!
-//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers) and
-//! says where; what is merely dirty (degenerate faces, unused vertices) it passes on to `clean`. Geometry
-//! that is not read is counted.
+//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers)
+//! and says where; what is merely dirty (degenerate faces, unused vertices) it passes on to
+//! `clean`. Geometry that is not read is counted.
 
 mod content;
 mod encoding;

@@ -5,9 +5,9 @@
 //! - numbers vertices by first use and forgets the others,
 //! - knows neither continued lines nor comments behind a statement.
 //!
-//! Other geometry (lines, points, curves, surfaces, other files) and unknown statements are counted. A comment
-//! ends with its line, even if it ends in a backslash: a path in a comment must not swallow a face; since some
-//! programs have it otherwise, these are counted, too.
+//! Other geometry (lines, points, curves, surfaces, other files) and unknown statements are
+//! counted. A comment ends with its line, even if it ends in a backslash: a path in a comment must
+//! not swallow a face; since some programs have it otherwise, these are counted, too.
 //!
 //! A first polygon that names all vertices makes it keep the numbers of the file. Groups, objects and
 //! materials do not reorder anything. A vertex's weight or colour and a corner's texture and normal indices
@@ -26,8 +26,8 @@ const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
     ignore_lines: false,
 };
 
-/// Statements without a surface of their own: attributes of vertices, groups, states, and what belongs to a
-/// curve or surface that is counted by itself.
+/// Statements without a surface of their own: attributes of vertices, groups, states, and what
+/// belongs to a curve or surface that is counted by itself.
 const WITHOUT_SURFACE: [&[u8]; 37] = [
     b"vt",
     b"vn",

@@ -1,4 +1,5 @@
-//! Object File Format: `OFF` and its variants with colours, normals, texture coordinates and other dimensions.
+//! Object File Format: `OFF` and its variants with colours, normals, texture coordinates and other
+//! dimensions.
 //!
 //! One vertex and one face a line, as every writer has it: only so can the optional values behind a
 //! vertex or a face be told from what follows. Counts are checked against the bytes before anything is
@@ -11,8 +12,9 @@ use crate::mesh::ParsedMesh;
 /// Shortest line of a vertex, `0 0 0`, and of a face, `1 0`, with their line end.
 const MIN_VERTEX_BYTES: usize = 6;
 const MIN_FACE_BYTES: usize = 4;
-/// What may stand before the keyword, each once: texture coordinates, colours, normals, a fourth coordinate,
-/// and a number of dimensions. Geomview wants them in this order, MeshLab writes them in another one.
+/// What may stand before the keyword, each once: texture coordinates, colours, normals, a fourth
+/// coordinate, and a number of dimensions. Geomview wants them in this order, MeshLab writes them
+/// in another one.
 const PREFIXES: [&[u8]; 5] = [b"ST", b"C", b"N", b"4", b"n"];
 
 /// Lines with their numbers, without comments and empty ones.
@@ -31,8 +33,8 @@ struct Keyword {
     dimensions: bool,
 }
 
-/// What the first line says, and what follows the keyword on it: counts, or nothing. Files may begin with
-/// their counts.
+/// What the first line says, and what follows the keyword on it: counts, or nothing. Files may
+/// begin with their counts.
 fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseError> {
     let first = words[0];
     let Some(at) = first.windows(3).position(|w| w == b"OFF") else {
@@ -72,7 +74,8 @@ fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseErro
 }
 
 impl Keyword {
-    /// Whether a vertex has a homogeneous coordinate beside the dimensions that the header gives, which must be 3.
+    /// Whether a vertex has a homogeneous coordinate beside the dimensions that the header gives,
+    /// which must be 3.
     fn is_homogeneous(&self, (line, dimensions): (usize, &[u8])) -> Result<bool, ParseError> {
         match number::<u64>(line, dimensions)? {
             3 => Ok(self.homogeneous),
@@ -120,7 +123,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let first: Vec<&[u8]> = words(first).collect();
     let (keyword, rest) = keyword(&first)?;
     let mut header: Vec<(usize, &[u8])> = rest.into_iter().map(|word| (line, word)).collect();
-    // The number of edges, which nobody needs, may be left out at the end of a line, but no count before it.
+    // The number of edges, which nobody needs, may be left out at the end of a line, but no count
+    // before it.
     let needed = 2 + usize::from(keyword.dimensions);
     while header.len() < needed {
         let (line, text) = lines.next().ok_or(ParseError::NoFaces)?;

@@ -3,9 +3,9 @@
 //! Header and binary rows are read by `ply-rs-bw`, rows of text here: its grammar has no `1.`, `.5` or
 //! `nan`, and none of a row's place. Of the element `vertex` its `x y z`, of the element `face` its list
 //! `vertex_indices` (or `vertex_index`) is read, whatever the types; other properties and elements are
-//! skipped. A text has a row a line, and what a line holds beyond its properties is left out, because some
-//! writers put there what their header does not declare. Rows of triangle strips and of edges are counted as
-//! unread beside faces. Counts are checked against the bytes before
+//! skipped. A text has a row a line, and what a line holds beyond its properties is left out,
+//! because some writers put there what their header does not declare. Rows of triangle strips and
+//! of edges are counted as unread beside faces. Counts are checked against the bytes before
 //! anything is allocated.
 
 use super::text::{first_line, number, words};
@@ -74,8 +74,8 @@ impl PropertyAccess for Row {
     }
 }
 
-/// The next line of a header and the bytes it takes with its end: LF, CR LF, or CR alone where `cr` says so.
-/// A binary body may begin with a byte like LF.
+/// The next line of a header and the bytes it takes with its end: LF, CR LF, or CR alone where `cr`
+/// says so. A binary body may begin with a byte like LF.
 fn header_line(rest: &[u8], cr: bool) -> (&[u8], usize) {
     let end = if cr { b'\r' } else { b'\n' };
     let length = rest.iter().position(|&b| b == end);

@@ -1,7 +1,7 @@
 //! STL, text and binary: triangles (in text, any polygons) that share no vertices.
 //!
-//! Text is read word by word, since some writers put a facet or a whole file on one line. Words behind a
-//! statement on its line that are no keyword, such as a colour, are counted as unread.
+//! Text is read word by word, since some writers put a facet or a whole file on one line. Words
+//! behind a statement on its line that are no keyword, such as a colour, are counted as unread.
 //!
 //! A file is binary if its length is the one that its count of triangles gives, or if it does not begin
 //! with `solid`: some binary files do begin so. Corners at equal positions become one vertex when the
@@ -170,8 +170,8 @@ impl Text {
     }
 }
 
-/// Words of the name behind `solid` or `endsolid`. It may have any words and ends with its line, or where a facet
-/// begins with its normal.
+/// Words of the name behind `solid` or `endsolid`. It may have any words and ends with its line, or
+/// where a facet begins with its normal.
 fn name(line: usize, rest: &[&[u8]]) -> usize {
     let facet = |words: &[&[u8]]| {
         is(words[0], "facet") && is(words[1], "normal") && number::<f64>(line, words[2]).is_ok()

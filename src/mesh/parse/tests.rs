@@ -330,7 +330,8 @@ fn texts_are_read_in_every_encoding_and_with_every_line_end() {
     }
 }
 
-/// A prism over a C, whose caps begin at any corner; by hand: 2 x 7 for the caps and 16 for the walls.
+/// A prism over a C, whose caps begin at any corner; by hand: 2 x 7 for the caps and 16 for the
+/// walls.
 fn c_prism(start: usize) -> String {
     let c = ["0 0", "3 0", "3 1", "1 1", "1 2", "3 2", "3 3", "0 3"];
     let vertices: String = [0, 1]

@@ -29,8 +29,8 @@ impl<'a> Iterator for Lines<'a> {
     }
 }
 
-/// The first line without its end, and the bytes that it takes with it. A line ends in LF, in CR LF, in CR CR LF (a
-/// text that was converted twice), or in CR alone.
+/// The first line without its end, and the bytes that it takes with it. A line ends in LF, in CR
+/// LF, in CR CR LF (a text that was converted twice), or in CR alone.
 pub(super) fn first_line(text: &[u8]) -> (&[u8], usize) {
     let Some(end) = text.iter().position(|b| matches!(b, b'\n' | b'\r')) else {
         return (text, text.len());
@@ -43,7 +43,8 @@ pub(super) fn first_line(text: &[u8]) -> (&[u8], usize) {
     (&text[..end], end + n)
 }
 
-/// Lines that end in CR alone, in a text that also has LF: the first release took such a CR for a space.
+/// Lines that end in CR alone, in a text that also has LF: the first release took such a CR for a
+/// space.
 pub(super) fn n_mixed_ends(text: &[u8]) -> usize {
     if !text.contains(&b'\r') || !text.contains(&b'\n') {
         return 0;

@@ -2,10 +2,11 @@
 //! constrained Delaunay triangulation of its projection onto its own plane.
 //!
 //! The fan comes first because it is what a convex polygon needs, and costs one pass. The Delaunay
-//! triangulation keeps every corner, also those on a straight line, which the neighbours of the polygon may
-//! share, and makes no slivers there; its predicates are exact. A polygon with a hole, which a bridge joins to
-//! the outer ring, is one polygon that passes the bridge twice: the inside is where the winding number is 1.
-//! A polygon that crosses itself or has no area keeps its fan, and the caller is told.
+//! triangulation keeps every corner, also those on a straight line, which the neighbours of the
+//! polygon may share, and makes no slivers there; its predicates are exact. A polygon with a hole,
+//! which a bridge joins to the outer ring, is one polygon that passes the bridge twice: the inside
+//! is where the winding number is 1. A polygon that crosses itself or has no area keeps its fan,
+//! and the caller is told.
 
 use super::{cross, dot, norm, sub};
 use spade::handles::FixedVertexHandle;
@@ -13,8 +14,8 @@ use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
 use std::collections::HashMap;
 use std::f64::consts::TAU;
 
-/// A polygon whose corners leave its plane by more than this share of its size is not planar: below it, how
-/// it is triangulated changes its area by less than a thousandth.
+/// A polygon whose corners leave its plane by more than this share of its size is not planar: below
+/// it, how it is triangulated changes its area by less than a thousandth.
 const PLANAR: f64 = 0.01;
 /// A polygon with less area than this share of its size squared has no plane, as cleaning has it.
 const MIN_AREA: f64 = 1e-12;
@@ -31,7 +32,8 @@ type Plane = ConstrainedDelaunayTriangulation<Point2<f64>>;
 pub struct PolygonKind {
     /// Whether its corners lie in a plane.
     pub planar: bool,
-    /// Whether it has an area and does not cross itself. Otherwise its triangles are its fan, whatever that is.
+    /// Whether it has an area and does not cross itself. Otherwise its triangles are its fan,
+    /// whatever that is.
     pub simple: bool,
     /// Whether its triangles are its fan from the first corner.
     pub fan: bool,
@@ -46,8 +48,9 @@ pub struct Triangulator {
 }
 
 impl Triangulator {
-    /// Gives `out` the triangles of a polygon: `corners.len() - 2` of them, or one degenerate triangle if there
-    /// are fewer than three corners; in the polygon's orientation. The same positions always give the same.
+    /// Gives `out` the triangles of a polygon: `corners.len() - 2` of them, or one degenerate
+    /// triangle if there are fewer than three corners; in the polygon's orientation. The same
+    /// positions always give the same.
     ///
     /// O(n log n) for ordinary polygons.
     ///
@@ -90,7 +93,8 @@ impl Triangulator {
         kind
     }
 
-    /// Projects a polygon onto the plane of its Newell normal; whether it was in it, `None` if there is none.
+    /// Projects a polygon onto the plane of its Newell normal; whether it was in it, `None` if
+    /// there is none.
     fn flatten(&mut self, vertices: &[[f64; 3]], corners: &[u32]) -> Option<bool> {
         let position = |v: u32| vertices[v as usize];
         let first = position(corners[0]);
@@ -120,7 +124,8 @@ impl Triangulator {
             return None;
         }
         let normal = normal.map(|x| x / doubled);
-        // The axis that is farthest from the normal, so that planes along axes are projected exactly.
+        // The axis that is farthest from the normal, so that planes along axes are projected
+        // exactly.
         let least = (0..3).fold(0, |l, i| {
             if normal[i].abs() < normal[l].abs() {
                 i
@@ -164,8 +169,8 @@ fn cross_2(a: [f64; 2], b: [f64; 2]) -> f64 {
     a[0] * b[1] - a[1] * b[0]
 }
 
-/// Whether the fan from the first corner, at the origin, covers a polygon once: all its triangles turn the same
-/// way, and not more than once around.
+/// Whether the fan from the first corner, at the origin, covers a polygon once: all its triangles
+/// turn the same way, and not more than once around.
 fn fan_covers(flat: &[[f64; 2]]) -> bool {
     let away = |p: &&[f64; 2]| **p != [0.0, 0.0];
     let spokes: Vec<&[f64; 2]> = match flat[1..].iter().position(|p| away(&p)) {
@@ -234,8 +239,9 @@ fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
     (!triangles.is_empty()).then_some(triangles)
 }
 
-/// The corners in the plane, the point of each, and for each point the first corner there. `None` if corners
-/// at different positions fall on one point, which is the case for a polygon that stands on its own plane.
+/// The corners in the plane, the point of each, and for each point the first corner there. `None`
+/// if corners at different positions fall on one point, which is the case for a polygon that stands
+/// on its own plane.
 fn points(
     flat: &[[f64; 2]],
     local: &[[f64; 3]],
@@ -245,7 +251,8 @@ fn points(
     let mut ring: Vec<FixedVertexHandle> = Vec::with_capacity(n);
     let mut corner_of: Vec<usize> = Vec::with_capacity(n);
     for (corner, p) in flat.iter().enumerate() {
-        // Below this a coordinate has no digits left in predicates; the unit is the size of the polygon.
+        // Below this a coordinate has no digits left in predicates; the unit is the size of the
+        // polygon.
         let [x, y] = p.map(|x| {
             if x.abs() < spade::MIN_ALLOWED_VALUE {
                 0.0
@@ -268,11 +275,13 @@ fn points(
     Some((plane, ring, corner_of))
 }
 
-/// How often the polygon passes along each pair of points; edges that other corners lie on are passed in pieces.
+/// How often the polygon passes along each pair of points; edges that other corners lie on are
+/// passed in pieces.
 type Passes = HashMap<(usize, usize), i32>;
 
-/// The plane with the polygon's edges in it, and how often each is passed; `None` if two of them cross, or if a
-/// corner that lies on an edge in the plane does not do so in space, where `place` says it is.
+/// The plane with the polygon's edges in it, and how often each is passed; `None` if two of them
+/// cross, or if a corner that lies on an edge in the plane does not do so in space, where `place`
+/// says it is.
 fn edges(
     mut plane: Plane,
     ring: &[FixedVertexHandle],

@@ -52,8 +52,9 @@ fn shoelace(polygon: &[[f64; 2]]) -> f64 {
     (0..n).map(part).sum()
 }
 
-/// What is left of the triangles' edges when those that two triangles pass in opposite directions are taken
-/// away, by positions: the polygon's edges, and nothing else, if the triangles hang together as they should.
+/// What is left of the triangles' edges when those that two triangles pass in opposite directions
+/// are taken away, by positions: the polygon's edges, and nothing else, if the triangles hang
+/// together as they should.
 fn border(edges: impl Iterator<Item = [[f64; 3]; 2]>) -> Vec<[[u64; 3]; 2]> {
     let mut passes: HashMap<[[u64; 3]; 2], i32> = HashMap::new();
     for [a, b] in edges {
@@ -414,7 +415,8 @@ fn cross_each_other(polygon: &[[f64; 2]]) -> bool {
     (0..n).any(|i| (i + 2..n).any(|j| (j + 1) % n != i && meet(i, j)))
 }
 
-/// Simple polygons of any form: a triangle whose edges are broken at random points as long as none cross.
+/// Simple polygons of any form: a triangle whose edges are broken at random points as long as none
+/// cross.
 fn simple_polygon() -> impl Strategy<Value = Vec<[f64; 2]>> {
     let points = prop::collection::vec((0..1000_i32, 0..1000_i32, any::<u16>()), 3..24);
     points.prop_map(|points| {
