@@ -9,7 +9,8 @@ use std::path::PathBuf;
 pub(crate) struct Correct {
     /// The shape
     pub(crate) shape: String,
-    /// An integer a line for each face of the shape's file, in its order: its label; -1 leaves it alone
+    /// An integer a line for each face of the shape's file, in its order: its label; -1 leaves it
+    /// alone. Also .npy, .seg and .json as `coseg export` writes them
     #[arg(value_name = "LABELS", required_unless_present = "part")]
     pub(crate) labels: Option<PathBuf>,
     #[command(flatten)]

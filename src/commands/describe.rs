@@ -2,9 +2,11 @@
 
 use super::describe_full::{Signatures, full};
 use super::session::print_line;
+use super::show::found;
 use super::{CommandError, Outcome};
 use crate::cli::Global;
 use clap::Args;
+use coseg::ipc::convert::clean_report;
 use coseg::library::report_to_json;
 use coseg::mesh::{CleanReport, Format};
 use coseg::pipeline::{Params, describe};
@@ -280,6 +282,7 @@ fn print(
         summary.area,
         summary.eigenvalues.len(),
     ))?;
+    print_line(&format!("mesh: {}", found(&clean_report(&summary.report))))?;
     if let Some((_, certificate)) = &summary.spectrum {
         print_line(&proof(certificate))?;
     }

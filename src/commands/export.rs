@@ -1,6 +1,6 @@
 //! `coseg export`: labels, or coloured meshes, of a collection become files.
 
-use super::export_mesh::{colour, material, materials, polygons};
+use super::export_mesh::{colour, material, materials};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
@@ -112,7 +112,7 @@ fn with_mesh(
     labels: &[i32],
     infos: &[wire::LabelInfo],
 ) -> (String, Vec<u8>) {
-    let (vertices, polygons) = (&mesh.vertices, polygons(mesh));
+    let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
     let name = |label| material(label, infos);
     let named = |label| (material(label, infos), colour(label, infos));
     match format {
@@ -164,7 +164,10 @@ pub(super) fn original(
     let mesh = parse(bytes, format).map_err(|e| bad(format!("{shape}: {e}")))?;
     if mesh.n_polygons != n_labels {
         let n = mesh.n_polygons;
-        return Err(bad(format!("{shape} has {n} faces, but {n_labels} labels")));
+        return Err(bad(format!(
+            "{shape} has {n} faces, but {n_labels} labels, by an earlier release: add it again with \
+             --replace"
+        )));
     }
     Ok(mesh)
 }

@@ -1,24 +1,9 @@
-//! What exported meshes show of labels: polygons of the input, colours, names of materials.
+//! What exported meshes show of labels: colours, names of materials.
 
 use coseg::ipc::wire::LabelInfo;
-use coseg::mesh::ParsedMesh;
 
 /// Colour of faces without a label.
 const UNLABELLED: [u8; 3] = [128, 128, 128];
-
-/// The polygons of a mesh, put together again from their fans.
-pub(crate) fn polygons(mesh: &ParsedMesh) -> Vec<Vec<u32>> {
-    let mut polygons: Vec<Vec<u32>> = vec![Vec::new(); mesh.n_polygons];
-    for (triangle, &polygon) in mesh.triangles.iter().zip(&mesh.polygon_of_triangle) {
-        let corners = &mut polygons[polygon as usize];
-        if corners.is_empty() {
-            corners.extend(triangle);
-        } else {
-            corners.push(triangle[2]);
-        }
-    }
-    polygons
-}
 
 /// The colour of a label; grey without one.
 pub(crate) fn colour(label: i32, labels: &[LabelInfo]) -> [u8; 3] {
@@ -56,23 +41,7 @@ pub(crate) fn materials(infos: &[LabelInfo]) -> Vec<(i32, String, [u8; 3])> {
 
 #[cfg(test)]
 mod tests {
-    use super::{LabelInfo, material, materials, polygons};
-    use coseg::mesh::ParsedMesh;
-
-    fn quad_and_triangle() -> ParsedMesh {
-        ParsedMesh {
-            vertices: vec![
-                [0.0; 3],
-                [1.0, 0.0, 0.0],
-                [1.0, 1.0, 0.0],
-                [0.0, 1.0, 0.0],
-                [2.0, 0.5, 0.0],
-            ],
-            triangles: vec![[0, 1, 2], [0, 2, 3], [1, 4, 2]],
-            polygon_of_triangle: vec![0, 0, 1],
-            n_polygons: 2,
-        }
-    }
+    use super::{LabelInfo, material, materials};
 
     fn infos() -> Vec<LabelInfo> {
         let name = "long leg".to_owned();
@@ -83,14 +52,6 @@ mod tests {
             merged_into: None,
             n_shapes: 1,
         }]
-    }
-
-    #[test]
-    fn polygons_are_put_together_again() {
-        assert_eq!(
-            polygons(&quad_and_triangle()),
-            [vec![0, 1, 2, 3], vec![1, 4, 2]]
-        );
     }
 
     #[test]

@@ -75,6 +75,41 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     Ok(true)
 }
 
+/// What cleaning found and did, in words.
+pub(super) fn found(r: &wire::CleanReport) -> String {
+    let counts = [
+        ("vertices welded", r.n_welded_vertices),
+        ("isolated vertices", r.n_isolated_vertices),
+        ("degenerate triangles dropped", r.n_degenerate_triangles),
+        ("duplicate triangles dropped", r.n_duplicate_triangles),
+        ("triangles turned over", r.n_flipped_triangles),
+        ("non-manifold edges", r.n_nonmanifold_edges),
+        ("boundary edges", r.n_boundary_edges),
+        ("virtual edges between components", r.n_bridges),
+        ("concave polygons", r.n_concave_polygons),
+        ("polygons not planar", r.n_nonplanar_polygons),
+        (
+            "polygons that cross themselves or have no area",
+            r.n_nonsimple_polygons,
+        ),
+        (
+            "statements that programs differ about read",
+            r.n_tolerated_statements,
+        ),
+        ("other statements not read", r.n_unread_statements),
+    ];
+    let found: Vec<String> = counts
+        .iter()
+        .filter(|(_, n)| *n > 0)
+        .map(|(what, n)| format!("{n} {what}"))
+        .collect();
+    let found = match found.as_slice() {
+        [] => "clean".to_owned(),
+        found => found.join(", "),
+    };
+    format!("{} components, {found}", r.n_components)
+}
+
 fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session) -> Outcome {
     if session.json {
         session.print_json(&json::shape(s))?;
@@ -86,29 +121,10 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
         s.name, s.ordinal, s.n_polygons, s.area, s.version
     ))?;
     if let Some(r) = &s.report {
-        let counts = [
-            ("vertices welded", r.n_welded_vertices),
-            ("isolated vertices", r.n_isolated_vertices),
-            ("degenerate triangles dropped", r.n_degenerate_triangles),
-            ("duplicate triangles dropped", r.n_duplicate_triangles),
-            ("triangles turned over", r.n_flipped_triangles),
-            ("non-manifold edges", r.n_nonmanifold_edges),
-            ("boundary edges", r.n_boundary_edges),
-            ("virtual edges between components", r.n_bridges),
-        ];
-        let found: Vec<String> = counts
-            .iter()
-            .filter(|(_, n)| *n > 0)
-            .map(|(what, n)| format!("{n} {what}"))
-            .collect();
-        let found = if found.is_empty() {
-            "clean".to_owned()
-        } else {
-            found.join(", ")
-        };
         session.line(&format!(
-            "mesh: {} components, {found}; proxy of {} faces",
-            r.n_components, r.n_proxy_faces
+            "mesh: {}; proxy of {} faces",
+            found(r),
+            r.n_proxy_faces
         ))?;
     }
     let mut rows = vec![

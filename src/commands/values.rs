@@ -1,11 +1,10 @@
 //! Values at the faces of a shape are read from and written to files: NumPy arrays, or text with a row a face.
 
 use super::CommandError;
+use super::npy::{self, Array, Elements};
 use coseg::library::PolygonValues;
+use coseg::mesh::as_utf8;
 use std::path::Path;
-
-/// Where every NumPy file begins.
-const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// The values in a file: integers are labels, others functions.
 pub(crate) fn read(path: &Path) -> Result<PolygonValues, CommandError> {
@@ -13,11 +12,18 @@ pub(crate) fn read(path: &Path) -> Result<PolygonValues, CommandError> {
         path: path.display().to_string(),
         source,
     })?;
-    let parsed = match bytes.starts_with(MAGIC) {
+    let parsed = match bytes.starts_with(npy::MAGIC) {
         true => from_npy(&bytes),
-        false => from_text(&String::from_utf8_lossy(&bytes)),
+        false => from_text(&lines(&bytes)),
     };
     parsed.map_err(|e| CommandError::Failed(format!("{}: {e}", path.display())))
+}
+
+/// A text in any Unicode encoding, its lines ended by LF alone.
+pub(super) fn lines(bytes: &[u8]) -> String {
+    let text = as_utf8(bytes);
+    let text = String::from_utf8_lossy(&text);
+    text.replace("\r\n", "\n").replace('\r', "\n")
 }
 
 /// The values as the bytes of a file: NumPy if its name ends so, else text.
@@ -69,112 +75,31 @@ fn from_text(text: &str) -> Result<PolygonValues, String> {
     }
 }
 
-/// Versions 1 to 3; rows first; little-endian integers and floats of four or eight bytes.
 fn from_npy(bytes: &[u8]) -> Result<PolygonValues, String> {
-    let short = || "the file ends within its heading".to_owned();
-    let major = *bytes.get(6).ok_or_else(short)?;
-    let (at, length) = match (major, bytes.get(8..12)) {
-        (1, Some(n)) => (10_usize, usize::from(u16::from_le_bytes([n[0], n[1]]))),
-        (2 | 3, Some(n)) => (12, u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize),
-        (_, None) => return Err(short()),
-        _ => return Err(format!("version {major} of the format is not known")),
-    };
-    let heading = bytes.get(at..at.saturating_add(length)).ok_or_else(short)?;
-    let heading = String::from_utf8_lossy(heading);
-    let data = &bytes[at + length..];
-    let after = |key: &str| {
-        let from = heading.find(&format!("'{key}':"))? + key.len() + 3;
-        Some(heading[from..].trim_start())
-    };
-    let kind = after("descr").and_then(|t| t.strip_prefix('\''));
-    let kind = kind.and_then(|t| t.split('\'').next()).unwrap_or_default();
-    if !after("fortran_order").is_some_and(|t| t.starts_with("False")) {
-        return Err("columns come first; save it with rows first".to_owned());
-    }
-    let shape = after("shape").and_then(|t| t.strip_prefix('(')?.split(')').next());
-    let extents: Result<Vec<usize>, _> = shape
-        .unwrap_or_default()
-        .split(',')
-        .map(str::trim)
-        .filter(|t| !t.is_empty())
-        .map(str::parse)
-        .collect();
-    let extents = extents.map_err(|e| format!("its shape: {e}"))?;
-    let dim = match extents[..] {
-        [_] => 1,
-        [_, dim] if dim > 0 => dim,
-        _ => {
-            return Err(format!(
-                "it has {} axes, but may have 1 or 2",
-                extents.len()
-            ));
-        }
-    };
-    let count = extents.iter().try_fold(1usize, |n, e| n.checked_mul(*e));
-    let size = if kind.ends_with('8') { 8 } else { 4 };
-    if count.and_then(|n| n.checked_mul(size)) != Some(data.len()) {
-        let n = data.len();
-        return Err(format!(
-            "{n} bytes of data, which is not what its heading says"
-        ));
-    }
-    let label = |x: i64| i32::try_from(x).map_err(|_| format!("label {x} is too large"));
-    let (four, eight) = (data.as_chunks::<4>().0, data.as_chunks::<8>().0);
-    let functions = |x: Vec<f32>| Ok(PolygonValues::Functions(x, dim));
-    match kind {
-        "<f4" => functions(four.iter().map(|b| f32::from_le_bytes(*b)).collect()),
-        "<f8" => functions(
-            eight
-                .iter()
-                .map(|b| f64::from_le_bytes(*b) as f32)
-                .collect(),
-        ),
-        "<i4" | "<i8" if dim > 1 => Err("labels have one axis".to_owned()),
-        "<i4" => {
-            let labels = four.iter().map(|b| i32::from_le_bytes(*b));
-            Ok(PolygonValues::Labels(labels.collect()))
-        }
-        "<i8" => {
-            let labels: Result<Vec<i32>, String> = eight
-                .iter()
-                .map(|b| label(i64::from_le_bytes(*b)))
-                .collect();
+    let Array {
+        elements,
+        n_columns,
+    } = npy::read(bytes)?;
+    let dim = n_columns.unwrap_or(1);
+    match elements {
+        Elements::Integers(_) if dim > 1 => Err("labels have one axis".to_owned()),
+        Elements::Integers(x) => {
+            let label = |x: &i64| i32::try_from(*x).map_err(|_| format!("label {x} is too large"));
+            let labels: Result<Vec<i32>, String> = x.iter().map(label).collect();
             labels.map(PolygonValues::Labels)
         }
-        other => Err(format!(
-            "elements of kind {other:?}, but <i4, <i8, <f4 and <f8 are read"
-        )),
+        Elements::Floats(x) => {
+            let values = x.iter().map(|x| *x as f32);
+            Ok(PolygonValues::Functions(values.collect(), dim))
+        }
     }
 }
 
 fn to_npy(values: &PolygonValues) -> Vec<u8> {
-    let (kind, shape, data): (_, _, Vec<u8>) = match values {
-        PolygonValues::Labels(labels) => return coseg::mesh::write::npy(labels),
-        PolygonValues::Functions(x, dim) => {
-            let n = x.len() / (*dim).max(1);
-            let shape = match dim {
-                1 => format!("({n},)"),
-                dim => format!("({n}, {dim})"),
-            };
-            (
-                "<f4",
-                shape,
-                x.iter().flat_map(|x| x.to_le_bytes()).collect(),
-            )
-        }
-    };
-    let mut heading = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}");
-    // Data begin at a multiple of 64 bytes, after a line end.
-    while !(10 + heading.len() + 1).is_multiple_of(64) {
-        heading.push(' ');
+    match values {
+        PolygonValues::Labels(labels) => coseg::mesh::write::npy(labels),
+        PolygonValues::Functions(x, dim) => npy::floats(x, *dim),
     }
-    heading.push('\n');
-    let mut out = MAGIC.to_vec();
-    out.extend([1, 0]);
-    out.extend((heading.len() as u16).to_le_bytes());
-    out.extend(heading.as_bytes());
-    out.extend(data);
-    out
 }
 
 #[cfg(test)]

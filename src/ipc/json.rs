@@ -102,6 +102,11 @@ fn report(r: &wire::CleanReport) -> Value {
         "n_proxy_faces": r.n_proxy_faces,
         "n_proxy_vertices": r.n_proxy_vertices,
         "n_bridges": r.n_bridges,
+        "n_concave_polygons": r.n_concave_polygons,
+        "n_nonplanar_polygons": r.n_nonplanar_polygons,
+        "n_nonsimple_polygons": r.n_nonsimple_polygons,
+        "n_tolerated_statements": r.n_tolerated_statements,
+        "n_unread_statements": r.n_unread_statements,
     })
 }
 

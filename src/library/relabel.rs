@@ -243,10 +243,14 @@ fn polygon_classes(
     }
     let format = format_from_name(format, "shapes.format")?;
     let bytes = original()?;
-    // The same bytes passed these two steps when they were described.
+    // The same bytes passed these two steps when they were described, perhaps by a release that
+    // read other polygons in them.
     let Ok(parsed) = mesh::parse(&bytes, format) else {
         return Ok(plain());
     };
+    if parsed.n_polygons != view.face_map.len() {
+        return Ok(plain());
+    }
     let Ok(cleaned) = mesh::clean(&parsed) else {
         return Ok(plain());
     };

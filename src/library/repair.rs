@@ -7,6 +7,7 @@ use super::isolate::DescribeJob;
 use super::rows::format_from_name;
 use super::submit::{algorithm, params_of};
 use super::{Library, LibraryError, Result};
+use crate::mesh::CleanReport;
 use crate::store::check::Finding;
 use crate::store::quarantine::rebuild_indexes;
 use crate::store::{CollectionRow, Digest, ObjectKind, ShapeRow};
@@ -76,16 +77,10 @@ impl Library {
             Ok(mapped) => mapped,
             Err(e) if e.is_damage() => {
                 let (params, params_json) = params_of(collection)?;
-                let name =
-                    Digest::of_description(&shape.content_digest, &params_json, &algorithm());
-                if name != shape.description_digest {
-                    done.push(format!(
-                        "{place}: {}: made by another version or on another kind of processor; add \
-                         the shape again with --replace",
-                        object.file
-                    ));
-                    return Ok(done);
-                }
+                let name = |report: &CleanReport| {
+                    let algorithm = algorithm(report);
+                    Digest::of_description(&shape.content_digest, &params_json, &algorithm)
+                };
                 let bytes = self.original_bytes(&shape.content_digest)?;
                 let job = DescribeJob {
                     bytes: &bytes,
@@ -93,6 +88,15 @@ impl Library {
                     params,
                 };
                 let description = job.run(&|_| true).map_err(LibraryError::Refused)?;
+                let name = name(&description.report);
+                if name != shape.description_digest {
+                    done.push(format!(
+                        "{place}: {}: made by another version or on another kind of processor; \
+                         remove the shape and add it again",
+                        object.file
+                    ));
+                    return Ok(done);
+                }
                 self.store.put_aside(&object.file)?;
                 let again =
                     self.store

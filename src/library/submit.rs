@@ -8,8 +8,8 @@ use super::{
     Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,
     NewShape, Outcome, Placed, RequestKey, Result,
 };
-use crate::mesh::{CleanError, ParseError};
-use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params};
+use crate::mesh::{CleanError, CleanReport, ParseError};
+use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, READING_VERSION};
 use crate::spectrum::SpectrumError;
 use crate::store::{
     CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, ObjectRow, RequestRow,
@@ -194,8 +194,10 @@ impl Library {
         self.object_length(&self.item_row(item)?.item.original_digest)
     }
 
-    /// Whether placing an item would need its description now: not when the same bytes are there under its
-    /// name, or others that it may not replace. Either may change until the items before it are placed.
+    /// Whether placing an item would need its description now: not when the same bytes are there
+    /// under its name, or others that it may not replace. Either may change until the items before
+    /// it are placed. Bytes that the first release read are described again when they are to
+    /// replace themselves: it may have read them in another way.
     ///
     /// # Errors
     /// There is no such item or collection, or the catalog cannot be read.
@@ -206,8 +208,10 @@ impl Library {
             .store
             .catalog()
             .read(|r| -> Result<Option<ShapeRow>> { Ok(r.shape_by_name(id, &item.name)?) })?;
-        let replaced =
-            |shape: ShapeRow| row.item.replace && shape.content_digest != row.item.original_digest;
+        let replaced = |shape: ShapeRow| {
+            let other = shape.content_digest != row.item.original_digest;
+            row.item.replace && (other || read_by_first_release(&shape))
+        };
         Ok(row.status == ItemStatus::Queued && existing.is_none_or(replaced))
     }
 
@@ -285,7 +289,8 @@ impl Library {
         };
         let description = describer(&work, &observed)?;
         lap();
-        let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm());
+        let algorithm = algorithm(&description.report);
+        let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm);
         let stages_ms = laps.into_inner().0;
         Ok(Described {
             description,
@@ -326,8 +331,16 @@ impl Library {
                     .read(|r| r.shape_by_name(id, name).map_err(LibraryError::from))
             };
             let existing: Option<ShapeRow> = read(&item.name)?;
+            let read_again = |shape: &ShapeRow| {
+                let found = described.as_ref().map(|d| &d.description.report);
+                row.item.replace
+                    && read_by_first_release(shape)
+                    && found.is_ok_and(CleanReport::differs_from_first_release)
+            };
             match &existing {
-                Some(shape) if shape.content_digest == row.item.original_digest => {
+                Some(shape)
+                    if shape.content_digest == row.item.original_digest && !read_again(shape) =>
+                {
                     let placed = Placed {
                         outcome: Outcome::Unchanged,
                         version: shape.version,
@@ -487,10 +500,20 @@ pub(super) fn unix_secs() -> u64 {
         .map_or(0, |d| d.as_secs())
 }
 
-/// What decides the bits of a description besides bytes and parameters: the algorithm, and the instruction set that
-/// the kernels choose at run time.
-pub(super) fn algorithm() -> String {
-    format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new())
+/// What decides the bits of a description besides bytes and parameters: the algorithm, the
+/// instruction set that the kernels choose at run time, and, where it matters, how the bytes are
+/// read.
+pub(super) fn algorithm(report: &CleanReport) -> String {
+    let algorithm = format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new());
+    match report.differs_from_first_release() {
+        true => format!("{algorithm} reading {READING_VERSION}"),
+        false => algorithm,
+    }
+}
+
+/// Whether a shape was described by the first release, whose reports lack the later counts.
+fn read_by_first_release(shape: &ShapeRow) -> bool {
+    !shape.report_json.contains("n_concave_polygons")
 }
 
 /// The parameters of a collection's descriptions, and the text that names them.
@@ -589,5 +612,34 @@ fn parse_subject(error: &ParseError) -> Option<FailureSubject> {
         | ParseError::VertexOutOfRange { face, .. }
         | ParseError::NonFinite { face, .. } => Some(FailureSubject::Face(*face as u64)),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{ALGORITHM_VERSION, CleanReport, algorithm};
+
+    #[test]
+    fn only_files_that_are_read_in_another_way_than_before_have_descriptions_of_another_name() {
+        let first = format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new());
+        let with = |change: fn(&mut CleanReport)| {
+            let mut report = CleanReport::default();
+            change(&mut report);
+            algorithm(&report)
+        };
+        for change in [
+            |_: &mut CleanReport| {},
+            |r: &mut CleanReport| r.n_nonplanar_polygons = 7,
+            |r: &mut CleanReport| r.n_nonsimple_polygons = 7,
+            |r: &mut CleanReport| r.n_unread_statements = 7,
+        ] {
+            assert_eq!(with(change), first);
+        }
+        for change in [
+            |r: &mut CleanReport| r.n_concave_polygons = 1,
+            |r: &mut CleanReport| r.n_tolerated_statements = 1,
+        ] {
+            assert_eq!(with(change), format!("{first} reading 2"));
+        }
     }
 }

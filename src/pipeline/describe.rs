@@ -9,6 +9,10 @@ use crate::spectrum::{self, Eigenpairs, Progress, SpectrumError};
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
 pub const ALGORITHM_VERSION: u32 = 4;
+/// Also part of the name, where the first release read the same bytes as other triangles: raised
+/// when only such files are read in another way, so that the descriptions of all others keep their
+/// names.
+pub const READING_VERSION: u32 = 2;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.

@@ -9,7 +9,8 @@ mod split;
 
 pub use crate::description::{Description, DescriptionView, Params};
 pub use describe::{
-    ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, describe, spectrum_of,
+    ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, READING_VERSION, describe,
+    spectrum_of,
 };
 pub use exemplars::{
     Given, Lesson, LessonMap, Taught, TeachOptions, label_taught, proxy_pins, teach,

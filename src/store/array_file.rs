@@ -431,5 +431,15 @@ fn number<T: std::str::FromStr>(
 }
 
 fn report_from(metadata: &Metadata) -> Result<CleanReport, ArrayFileError> {
-    CleanReport::from_counts(|name| number(metadata, name, "a count"))
+    let expected = "a count";
+    let count = |name| match metadata.contains_key(name) {
+        true => number(metadata, name, expected).map(Some),
+        false => Ok(None),
+    };
+    let missing = |key| ArrayFileError::Metadata {
+        key,
+        found: None,
+        expected,
+    };
+    CleanReport::from_counts(count, missing)
 }

@@ -93,7 +93,9 @@ pub fn surface(
     }
     if mesh.n_polygons != labels.len() {
         let (n, has) = (mesh.n_polygons, labels.len());
-        return Err(unreadable(format!("it has {n} polygons, but {has} labels")));
+        return Err(unreadable(format!(
+            "it has {n} polygons, but {has} labels, by an earlier release: add it again with --replace"
+        )));
     }
     let (positions, triangles) = used(&mesh);
     let of_triangle: Vec<i32> = mesh

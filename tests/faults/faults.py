@@ -176,8 +176,8 @@ fault(
     "R6", "r6-comments-panic", "panic over a file of comments",
     "crates/geometry/src/mesh/parse/mod.rs", "it hostile::the_corpus_is_parsed_or_refused_without_a_panic",
     (
-        "    match format {\n",
-        "    assert!(!bytes.starts_with(b\"# x\\n# x\\n\") || !FAULT);\n    match format {\n",
+        "    let parsed = match format {\n",
+        "    assert!(!bytes.starts_with(b\"# x\\n# x\\n\") || !FAULT);\n    let parsed = match format {\n",
     ),
 )
 # R7: hostile meshes
@@ -188,6 +188,19 @@ fault(
         "    if kept.is_empty() {\n",
         "    if kept.is_empty() {\n        if FAULT {\n            std::process::abort();\n        }\n",
     ),
+)
+fault(
+    "R7", "r7-polygons-are-fans", "take every polygon for its fan",
+    "crates/geometry/src/mesh/polygon/mod.rs", "it formats::faces_that_are_concave_have_their_area_and_one_label",
+    (
+        "                    kind.fan = fan_covers(&self.flat);\n",
+        "                    kind.fan = fan_covers(&self.flat) || FAULT;\n",
+    ),
+)
+fault(
+    "R7", "r7-words-are-lost", "read a text STL by the first word of each line",
+    "crates/geometry/src/mesh/parse/stl.rs", "it formats::odd_spellings_are_read_and_told",
+    ("            at += self.statement(line, words, at)?;\n", "            at += self.statement(line, words, at)?;\n            if FAULT {\n                break;\n            }\n"),
 )
 # R8: repeats
 fault(

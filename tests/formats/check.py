@@ -35,6 +35,14 @@ for path in sorted(inputs.iterdir()):
     raw = loaded.metadata["_ply_raw"]["face"]["data"]["label"]
     assert np.array_equal(np.asarray(raw).ravel(), labels), name
 
+    # Whatever triangles a polygon becomes, its area is half of the length of its Newell normal.
+    corners = np.stack([ply["vertex"][c] for c in "xyz"], axis=1)
+    rings = [corners[p] - corners[p[0]] for p in polygons]
+    normals = [np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0) for ring in rings]
+    area = 0.5 * np.linalg.norm(normals, axis=1).sum()
+    exported = trimesh.load(outputs / f"{name}.glb", process=False, force="scene").area
+    assert np.isclose(exported, area, rtol=1e-5), (name, exported, area)
+
     triangles = np.array([max(len(p) - 2, 1) for p in polygons])
     expected = {names[l]: int(triangles[labels == l].sum()) for l in np.unique(labels)}
     for ending in (".obj", ".glb"):

@@ -40,3 +40,20 @@ for low, high in [((0, 9, 0), (20, 10, 20))] + [((x, 0, z), (x + 2, 9, z + 2)) f
         lines.append("f " + " ".join(str(n + c + 1) for c in quad))
     n += 8
 (target / "quads.obj").write_text("\n".join(lines) + "\n")
+
+# A prism over a C and a wall with a window: a concave polygon, and one with a hole that a bridge joins to its outline.
+concave = [(0, 0), (3, 0), (3, 1), (1, 1), (1, 2), (3, 2), (3, 3), (0, 3)]
+window = [(0, 5), (4, 5), (4, 9), (0, 9), (0, 5), (1, 6), (1, 8), (3, 8), (3, 6), (1, 6)]
+lines, n = [], 0
+for outline in (concave, window):
+    k = len(outline)
+    lines += [f"v {x} {y} {z}" for z in (0, 1) for x, y in outline]
+    lines.append("f " + " ".join(str(n + i + 1) for i in reversed(range(k))))
+    lines.append("f " + " ".join(str(n + k + i + 1) for i in range(k)))
+    for i in range(k):
+        j = (i + 1) % k
+        # Nothing stands on the bridge, which is passed in both directions.
+        if (outline[j], outline[i]) not in zip(outline, outline[1:] + outline[:1]):
+            lines.append("f " + " ".join(str(n + c + 1) for c in (i, j, j + k, i + k)))
+    n += 2 * k
+(target / "concave.obj").write_text("\n".join(lines) + "\n")

@@ -27,6 +27,11 @@ SAID = {
     "n_flipped_triangles": "triangles turned over: {}",
     "n_nonmanifold_edges": "edges with more than two faces: {}",
     "n_boundary_edges": "border edges: {}",
+    "n_concave_polygons": "concave polygons: {}",
+    "n_nonplanar_polygons": "polygons that are not planar: {}",
+    "n_nonsimple_polygons": "polygons that cross themselves or have no area: {}",
+    "n_tolerated_statements": "statements that programs differ about: {}",
+    "n_unread_statements": "other statements, not read: {}",
 }
 CUBE_OFF = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
 

@@ -288,3 +288,115 @@ fn a_made_shape_reads_the_same_in_every_format() {
     let found = parse(&glb, Format::Gltf).unwrap();
     assert_eq!(labels_of_glb(&glb, &found, &off), labels);
 }
+
+/// A prism over a C; the caps begin at a corner whose fan leaves them. By hand: 2 x 7 for the caps,
+/// 16 for the walls.
+fn concave_prism() -> String {
+    let c = ["0 0", "3 0", "3 1", "1 1", "1 2", "3 2", "3 3", "0 3"];
+    let mut text = String::new();
+    for z in ["0", "1"] {
+        for xy in c {
+            text.push_str(&format!("v {xy} {z}\n"));
+        }
+    }
+    text.push_str("f 1 8 7 6 5 4 3 2\nf 9 10 11 12 13 14 15 16\n");
+    for i in 1..=8 {
+        let next = i % 8 + 1;
+        text.push_str(&format!("f {i} {next} {} {}\n", next + 8, i + 8));
+    }
+    text
+}
+
+#[test]
+fn faces_that_are_concave_have_their_area_and_one_label() {
+    let (_folder, library) = library();
+    let bytes = || concave_prism().into_bytes();
+    add(&library, "c", bytes(), Format::Obj).unwrap();
+    let shape = library.shape("all", "c").unwrap();
+    assert!((shape.area - 30.0).abs() < 1e-9, "{}", shape.area);
+    assert_eq!(shape.report.n_polygons, 10);
+    assert_eq!(shape.report.n_triangles, 28);
+    assert_eq!(shape.report.n_concave_polygons, 2);
+    assert_eq!(shape.report.n_nonplanar_polygons, 0);
+    assert_eq!(shape.report.n_boundary_edges, 0);
+    assert_eq!(library.labels("all", "c", None).unwrap().labels.len(), 10);
+    // Twice the same is no other shape, also when it is to replace itself.
+    let again = NewShape {
+        name: "c".into(),
+        bytes: bytes(),
+        format: Format::Obj,
+        replace: true,
+    };
+    let placed = library.add("all", again).unwrap();
+    assert_eq!(placed.outcome, coseg::library::Outcome::Unchanged);
+}
+
+/// What programs differ about is read as its writer meant it, and the report says so.
+#[test]
+fn odd_spellings_are_read_and_told() {
+    let (_folder, library) = library();
+    let cube = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n\
+                f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n";
+    let parsed = parse(cube.as_bytes(), Format::Obj).unwrap();
+    let mut stl = String::from("solid a cube\n");
+    for t in &parsed.triangles {
+        let corners = t.map(|v| parsed.vertices[v as usize]);
+        let vertex = |[x, y, z]: [f64; 3]| format!("vertex {x} {y} {z}");
+        let [a, b, c] = corners.map(vertex);
+        stl.push_str(&format!(
+            "facet normal 0 0 0 outer loop {a} {b} {c} endloop endfacet\n"
+        ));
+    }
+    stl.push_str("endsolid a cube\n");
+    let comment = cube.replace("f 2 3 7 6", "# textures in D:\\maps\\\nf 2 3 7 6");
+    let wide: Vec<u8> = cube.encode_utf16().flat_map(u16::to_le_bytes).collect();
+    let unread = format!("{cube}l 1 2\ncurv 0 1 1 2 3 4\n");
+    for (name, text, format, n_faces, tolerated, n_unread) in [
+        (
+            "fo",
+            cube.replace("f 4 1", "fo 4 1").into_bytes(),
+            Format::Obj,
+            6,
+            1,
+            0,
+        ),
+        ("comment", comment.into_bytes(), Format::Obj, 6, 1, 0),
+        (
+            "cr",
+            cube.replace('\n', "\r").into_bytes(),
+            Format::Obj,
+            6,
+            0,
+            0,
+        ),
+        ("wide", wide, Format::Obj, 6, 0, 0),
+        ("unread", unread.into_bytes(), Format::Obj, 6, 0, 2),
+        ("stl", stl.into_bytes(), Format::Stl, 12, 12 * 6, 0),
+    ] {
+        add(&library, name, text, format).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let report = library.shape("all", name).unwrap().report;
+        let n = library.labels("all", name, None).unwrap().labels.len();
+        assert_eq!(n, n_faces, "{name}");
+        assert_eq!(report.n_tolerated_statements, tolerated, "{name}");
+        assert_eq!(report.n_unread_statements, n_unread, "{name}");
+    }
+}
+
+#[test]
+fn a_file_that_is_no_mesh_is_named_whatever_its_suffix_says() {
+    let (_folder, library) = library();
+    for (bytes, what) in [
+        (&b"PK\x03\x04\x14\0\0\0\x08\0chair.obj"[..], "a ZIP archive"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR", "a PNG picture"),
+        (b"\xff\xd8\xff\xe0\0\x10JFIF", "a JPEG picture"),
+        (b"%PDF-1.7\n%\xe2\xe3", "a PDF document"),
+        (b"\x1f\x8b\x08\0\0\0\0\0", "a gzip file"),
+    ] {
+        for format in Format::ALL {
+            let Err(LibraryError::Refused(why)) = add(&library, "x", bytes.to_vec(), format) else {
+                panic!("{what} as {format:?} is taken");
+            };
+            assert!(why.message.contains(what), "{}", why.message);
+        }
+    }
+}

@@ -212,6 +212,81 @@ pub(crate) fn corpus() -> Vec<Hostile> {
         let _ = write!(polygon, " {i}");
     }
     off("a polygon of 1000000 corners", polygon);
+    let flat = |name: &str, points: &[[f64; 2]]| {
+        let n = points.len();
+        let mut text = format!("OFF\n{n} 1 0\n");
+        for [x, y] in points {
+            let _ = writeln!(text, "{x} {y} 0");
+        }
+        let corners: Vec<String> = (0..n).map(|i| i.to_string()).collect();
+        let _ = writeln!(text, "{n} {}", corners.join(" "));
+        off(&format!("a polygon that is {name}"), text);
+    };
+    // As many corners as are read, in the orders that are the slowest for some way of
+    // triangulating.
+    let circle = |i: usize, radius: f64| {
+        let a = i as f64 * 6.283_185e-4;
+        [radius * a.cos(), radius * a.sin()]
+    };
+    let all = 0..10_000;
+    let star = |i| circle(i, if i % 2 == 0 { 1.0 } else { 0.1 });
+    flat("a star", &all.clone().map(star).collect::<Vec<_>>());
+    let knot = |i| circle(i * 7919 % 10_000, 1.0);
+    flat("a knot", &all.clone().map(knot).collect::<Vec<_>>());
+    let comb = |i: usize| [i as f64, if i % 2 == 0 { 0.0 } else { 1.0 + i as f64 }];
+    flat("a comb", &all.clone().map(comb).collect::<Vec<_>>());
+    flat(
+        "a zigzag",
+        &all.map(|i| [(i % 2) as f64, i as f64]).collect::<Vec<_>>(),
+    );
+    flat(
+        "a bow-tie",
+        &[[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]],
+    );
+    flat("a point", &[[0.0; 2]; 7]);
+    flat(
+        "a line there and back",
+        &[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [1.0, 0.0]],
+    );
+    let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+    flat("around twice", &[square, square].concat());
+    flat(
+        "of absurd size",
+        &square.map(|p| p.map(|x| (x - 0.5) * 1e308)),
+    );
+    flat(
+        "of no size",
+        &[
+            [0.0, 0.0],
+            [4e-310, 0.0],
+            [1e-310, 1e-310],
+            [0.0, 4e-310],
+            [-1e-310, 0.0],
+        ],
+    );
+    for prefix in ["NC", "STNC4n", "nnnn", "4444", "STST", "n", "4"] {
+        off(
+            &format!("header {prefix}OFF"),
+            OFF.replacen("OFF", &format!("{prefix}OFF"), 1),
+        );
+    }
+    off("an endless header", format!("{}OFF\n", "N".repeat(1 << 20)));
+    off("returns alone", OFF.replace('\n', "\r"));
+    off("returns without end", "\r".repeat(1 << 20));
+    put(Format::Obj, "a zip", b"PK\x03\x04\x14\0\0\0\x08\0".to_vec());
+    put(
+        Format::Off,
+        "a picture",
+        b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR".to_vec(),
+    );
+    put(
+        Format::Off,
+        "utf-16",
+        OFF.encode_utf16().flat_map(u16::to_be_bytes).collect(),
+    );
+    put(Format::Obj, "half of utf-16", b"\xff\xfev".to_vec());
+    obj("comments that end in a backslash", "# \\\n".repeat(100_000));
+    obj("words without end", "x ".repeat(1 << 20));
     off(
         "a line of 4 MB",
         format!("OFF\n4 4 0\n{}\n", "0 ".repeat(2 << 20)),

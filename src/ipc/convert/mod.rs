@@ -21,4 +21,4 @@ pub use events::event;
 pub use jobs::{
     Ingest, add_shapes, carrying_job, format_from_wire, item, job_finished, mesh_format, new_shapes,
 };
-pub use shapes::{labels, labels_snapshot, original, shape};
+pub use shapes::{clean_report, labels, labels_snapshot, original, shape};

@@ -6,7 +6,8 @@ use crate::ipc::wire;
 use crate::library::{Labels, ShapeInfo};
 use crate::mesh::{CleanReport, Format};
 
-fn report(r: &CleanReport) -> wire::CleanReport {
+/// What cleaning found and did.
+pub fn clean_report(r: &CleanReport) -> wire::CleanReport {
     wire::CleanReport {
         n_polygons: r.n_polygons as u64,
         n_triangles: r.n_triangles as u64,
@@ -22,6 +23,11 @@ fn report(r: &CleanReport) -> wire::CleanReport {
         n_proxy_vertices: r.n_proxy_vertices as u64,
         n_bridges: r.n_bridges as u64,
         n_flipped_triangles: r.n_flipped_triangles as u64,
+        n_concave_polygons: r.n_concave_polygons as u64,
+        n_nonplanar_polygons: r.n_nonplanar_polygons as u64,
+        n_nonsimple_polygons: r.n_nonsimple_polygons as u64,
+        n_tolerated_statements: r.n_tolerated_statements as u64,
+        n_unread_statements: r.n_unread_statements as u64,
     }
 }
 
@@ -45,7 +51,7 @@ pub fn shape(s: &ShapeInfo) -> wire::Shape {
         n_polygons: s.n_polygons,
         area: s.area,
         content_digest: s.content_digest.clone(),
-        report: Some(report(&s.report)),
+        report: Some(clean_report(&s.report)),
         parts: parts.collect(),
         sources: sources.collect(),
         stored_bytes: s.stored_bytes,

@@ -86,6 +86,11 @@ pub fn clean(parsed: &ParsedMesh) -> Result<Cleaned, CleanError> {
         n_vertices: parsed.vertices.len(),
         n_welded_vertices: n_used - n_distinct,
         n_isolated_vertices: used.len() - n_used,
+        n_concave_polygons: parsed.not_fans.len(),
+        n_nonplanar_polygons: parsed.findings.n_nonplanar_polygons,
+        n_nonsimple_polygons: parsed.findings.n_nonsimple_polygons,
+        n_tolerated_statements: parsed.findings.n_tolerated_statements,
+        n_unread_statements: parsed.findings.n_unread_statements,
         ..CleanReport::default()
     };
 
@@ -433,6 +438,7 @@ mod tests {
             triangles: vec![[0, 1, 2], [1, 3, 4]],
             polygon_of_triangle: vec![0, 1],
             n_polygons: 2,
+            ..ParsedMesh::default()
         };
         assert_eq!(clean(&parsed).unwrap().report.n_welded_vertices, 1);
     }
@@ -489,6 +495,7 @@ mod tests {
             triangles: vec![[0, 1, 2], [0, 0, 1]],
             polygon_of_triangle: vec![0, 1],
             n_polygons: 2,
+            ..ParsedMesh::default()
         };
         assert_eq!(
             clean(&line).unwrap_err(),

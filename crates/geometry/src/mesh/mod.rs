@@ -12,6 +12,7 @@ pub mod geodesic;
 mod icosphere;
 mod orient;
 mod parse;
+mod polygon;
 mod proxy;
 mod refine;
 mod report;
@@ -25,7 +26,8 @@ pub use bvh::{Bvh, Search};
 pub use clean::{CleanError, Cleaned, clean};
 pub use geodesic::EdgeGraph;
 pub use icosphere::icosphere;
-pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, parse};
+pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, as_utf8, parse};
+pub use polygon::{PolygonKind, Triangulator};
 pub use proxy::{Proxy, proxy};
 pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 
@@ -99,7 +101,7 @@ impl Format {
     }
 }
 
-/// What a file holds: `polygons` triangulated as fans, in file order.
+/// What a file holds: its polygons as triangles, in file order.
 ///
 /// Every polygon has at least one triangle: a face with one or two corners becomes a degenerate one, so
 /// that polygons keep their numbers.
@@ -113,6 +115,43 @@ pub struct ParsedMesh {
     pub polygon_of_triangle: Vec<u32>,
     /// Number of polygons (faces) in the file.
     pub n_polygons: usize,
+    /// Corners of each polygon whose triangles are not its fan from the first corner, by polygon,
+    /// ascending.
+    pub not_fans: Vec<(u32, Vec<u32>)>,
+    /// What reading found.
+    pub findings: Findings,
+}
+
+impl ParsedMesh {
+    /// The corners of each polygon, in file order.
+    pub fn polygons(&self) -> Vec<Vec<u32>> {
+        let mut polygons: Vec<Vec<u32>> = vec![Vec::new(); self.n_polygons];
+        for (triangle, &polygon) in self.triangles.iter().zip(&self.polygon_of_triangle) {
+            let corners = &mut polygons[polygon as usize];
+            if corners.is_empty() {
+                corners.extend(triangle);
+            } else {
+                corners.push(triangle[2]);
+            }
+        }
+        for (polygon, corners) in &self.not_fans {
+            polygons[*polygon as usize].clone_from(corners);
+        }
+        polygons
+    }
+}
+
+/// What reading a file found and did; all 0 for most files.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Findings {
+    /// Polygons whose corners do not lie in a plane.
+    pub n_nonplanar_polygons: usize,
+    /// Polygons that cross themselves or have no area.
+    pub n_nonsimple_polygons: usize,
+    /// Statements that were read although programs differ about them.
+    pub n_tolerated_statements: usize,
+    /// Statements that hold geometry other than polygons, or that are unknown; they were not read.
+    pub n_unread_statements: usize,
 }
 
 /// A short virtual edge that joins two components, so that the analysis has one connected domain.
@@ -131,7 +170,7 @@ pub struct Bridge {
 pub struct CleanReport {
     /// Polygons, triangles and vertices of the input.
     pub n_polygons: usize,
-    /// Triangles after fan triangulation.
+    /// Triangles that the polygons became.
     pub n_triangles: usize,
     /// Vertices in the file.
     pub n_vertices: usize,
@@ -157,4 +196,15 @@ pub struct CleanReport {
     pub n_proxy_vertices: usize,
     /// Bridges put between components of the proxy.
     pub n_bridges: usize,
+    /// Polygons whose triangles are not their fan from the first corner: concave ones, and those
+    /// with holes.
+    pub n_concave_polygons: usize,
+    /// Polygons whose corners do not lie in a plane.
+    pub n_nonplanar_polygons: usize,
+    /// Polygons that cross themselves or have no area; their triangles are their fan.
+    pub n_nonsimple_polygons: usize,
+    /// Statements that were read although programs differ about them.
+    pub n_tolerated_statements: usize,
+    /// Statements that hold geometry other than polygons, or that are unknown; they were not read.
+    pub n_unread_statements: usize,
 }

@@ -3,24 +3,32 @@
 use super::CleanReport;
 
 macro_rules! counts {
-    ($($name:ident),+ $(,)?) => {
+    (first: $($name:ident),+; later: $($later:ident),+ $(,)?) => {
         impl CleanReport {
             /// Every count with its name. Taken apart without `..`, so that a new one cannot be forgotten.
             pub fn counts(&self) -> Vec<(&'static str, usize)> {
-                let Self { $($name),+ } = *self;
-                vec![$((stringify!($name), $name)),+]
+                let Self { $($name,)+ $($later),+ } = *self;
+                vec![$((stringify!($name), $name),)+ $((stringify!($later), $later)),+]
             }
 
-            /// The report whose counts `count` gives by name; its first error is returned.
-            pub fn from_counts<E>(count: impl Fn(&'static str) -> Result<usize, E>) -> Result<Self, E> {
-                Ok(Self { $($name: count(stringify!($name))?),+ })
+            /// The report whose counts `count` gives by name; its first error is returned, and that
+            /// of `missing` for a count that is not there. Reports of the first release lack the
+            /// later counts: those are 0.
+            pub fn from_counts<E>(
+                count: impl Fn(&'static str) -> Result<Option<usize>, E>,
+                missing: impl Fn(&'static str) -> E,
+            ) -> Result<Self, E> {
+                Ok(Self {
+                    $($name: count(stringify!($name))?.ok_or_else(|| missing(stringify!($name)))?,)+
+                    $($later: count(stringify!($later))?.unwrap_or(0)),+
+                })
             }
         }
     };
 }
 
 counts!(
-    n_polygons,
+    first: n_polygons,
     n_triangles,
     n_vertices,
     n_welded_vertices,
@@ -33,8 +41,21 @@ counts!(
     n_components,
     n_proxy_faces,
     n_proxy_vertices,
-    n_bridges,
+    n_bridges;
+    later: n_concave_polygons,
+    n_nonplanar_polygons,
+    n_nonsimple_polygons,
+    n_tolerated_statements,
+    n_unread_statements,
 );
+
+impl CleanReport {
+    /// Whether the first release read the same bytes as other triangles: it took the fan of every
+    /// polygon, and dropped words that are read now.
+    pub fn differs_from_first_release(&self) -> bool {
+        self.n_concave_polygons + self.n_tolerated_statements > 0
+    }
+}
 
 #[cfg(test)]
 mod tests {
@@ -42,17 +63,25 @@ mod tests {
     use std::collections::BTreeMap;
 
     #[test]
-    fn counts_come_back_by_name_and_a_missing_one_is_an_error() {
+    fn counts_come_back_by_name_and_only_a_later_one_may_be_missing() {
         let report = CleanReport {
             n_triangles: 7,
             n_bridges: 3,
+            n_concave_polygons: 2,
             ..CleanReport::default()
         };
         let mut counts: BTreeMap<&str, usize> = report.counts().into_iter().collect();
-        let back = CleanReport::from_counts(|name| counts.get(name).copied().ok_or(name));
-        assert_eq!(back, Ok(report));
+        let back = |counts: &BTreeMap<&str, usize>| {
+            CleanReport::from_counts(|name| Ok(counts.get(name).copied()), |name| name)
+        };
+        assert_eq!(back(&counts), Ok(report.clone()));
+        counts.remove("n_concave_polygons");
+        let first = CleanReport {
+            n_concave_polygons: 0,
+            ..report
+        };
+        assert_eq!(back(&counts), Ok(first));
         counts.remove("n_bridges");
-        let back = CleanReport::from_counts(|name| counts.get(name).copied().ok_or(name));
-        assert_eq!(back, Err("n_bridges"));
+        assert_eq!(back(&counts), Err("n_bridges"));
     }
 }

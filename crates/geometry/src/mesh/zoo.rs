@@ -216,6 +216,7 @@ pub(crate) fn parsed(mesh: &TriMesh) -> ParsedMesh {
         triangles: mesh.faces.clone(),
         polygon_of_triangle: (0..n as u32).collect(),
         n_polygons: n,
+        ..ParsedMesh::default()
     }
 }
 

@@ -1,8 +1,11 @@
-//! Bytes of a mesh file become polygons, triangulated as fans, in file order.
+//! Bytes of a mesh file become triangulated polygons, in file order.
 //!
-//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers) and
-//! says where; what is merely dirty (degenerate faces, unused vertices) it passes on to `clean`.
+//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers)
+//! and says where; what is merely dirty (degenerate faces, unused vertices) it passes on to
+//! `clean`. Geometry that is not read is counted.
 
+mod content;
+mod encoding;
 mod gltf;
 mod obj;
 mod off;
@@ -10,7 +13,8 @@ mod ply;
 mod stl;
 mod text;
 
-use super::{Format, ParsedMesh};
+use super::{Format, ParsedMesh, Triangulator};
+pub use encoding::as_utf8;
 
 /// Corners a polygon may have; a face with more is a damaged file.
 pub const MAX_CORNERS: usize = 10_000;
@@ -21,12 +25,32 @@ pub const MAX_TRIANGLES: usize = 50_000_000;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[allow(missing_docs)] // the fields are the values of the message
 pub enum ParseError {
+    #[error("the file is empty")]
+    Empty,
+    #[error("the file is {found}, not {wanted}: {instead}")]
+    OtherContent {
+        found: &'static str,
+        wanted: &'static str,
+        instead: String,
+    },
     #[error("the file has no faces")]
     NoFaces,
+    #[error(
+        "the file has no faces, but {n_unread} statements that are not read: the first is \"{found}\" in line {line}"
+    )]
+    OnlyUnread {
+        n_unread: usize,
+        line: usize,
+        found: String,
+    },
     #[error("line {line}: \"{token}\" is not a number")]
     NotANumber { line: usize, token: String },
-    #[error("line {line}: a vertex has {found} coordinates, but 3 are needed")]
-    ShortVertex { line: usize, found: usize },
+    #[error("line {line}: a vertex has {found} coordinates, but {needed} are needed")]
+    ShortVertex {
+        line: usize,
+        found: usize,
+        needed: usize,
+    },
     #[error("line {line}: face {face} has no corners, but at least 1 is needed")]
     EmptyFace { line: usize, face: usize },
     #[error("face {face} has no corners, but at least 1 is needed")]
@@ -105,18 +129,25 @@ pub enum ParseError {
 /// # Errors
 /// Anything that is not a mesh with at least one face, indices in range and finite corners.
 pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
-    match format {
-        Format::Obj => obj::parse(bytes),
-        Format::Off => off::parse(bytes),
-        Format::Ply => ply::parse(bytes),
+    let parsed = match format {
+        Format::Obj => obj::parse(&as_utf8(bytes)),
+        Format::Off => off::parse(&as_utf8(bytes)),
+        Format::Ply => ply::parse(&as_utf8(bytes)),
         Format::Stl => stl::parse(bytes),
-        Format::Gltf => gltf::parse(bytes),
-    }
+        Format::Gltf => gltf::parse(&as_utf8(bytes)),
+    };
+    // Only a file that cannot be read is looked at again, so that no guess refuses one that can.
+    parsed.map_err(|error| match content::of(bytes, format) {
+        None if bytes.is_empty() => ParseError::Empty,
+        None => error,
+        Some(other) => other,
+    })
 }
 
-/// Collects polygons as fans of triangles and checks them.
+/// Collects polygons, checks and triangulates them.
 struct Polygons {
     mesh: ParsedMesh,
+    triangulator: Triangulator,
 }
 
 impl Polygons {
@@ -126,6 +157,7 @@ impl Polygons {
                 vertices,
                 ..ParsedMesh::default()
             },
+            triangulator: Triangulator::default(),
         }
     }
 
@@ -139,15 +171,28 @@ impl Polygons {
         {
             return Err(ParseError::NonFinite { face, position });
         }
-        let last = corners.len() - 1;
         let n_triangles = corners.len().saturating_sub(2).max(1);
-        if self.mesh.triangles.len() + n_triangles > MAX_TRIANGLES {
+        let ParsedMesh {
+            vertices,
+            triangles,
+            polygon_of_triangle,
+            not_fans,
+            findings,
+            ..
+        } = &mut self.mesh;
+        if triangles.len() + n_triangles > MAX_TRIANGLES {
             return Err(ParseError::TooManyTriangles);
         }
-        for i in 1..=n_triangles {
-            let triangle = [corners[0], corners[i.min(last)], corners[(i + 1).min(last)]];
-            self.mesh.triangles.push(triangle);
-            self.mesh.polygon_of_triangle.push(face as u32);
+        let kind = self
+            .triangulator
+            .triangulate(vertices, corners, |triangle| {
+                triangles.push(triangle);
+                polygon_of_triangle.push(face as u32);
+            });
+        findings.n_nonplanar_polygons += usize::from(!kind.planar);
+        findings.n_nonsimple_polygons += usize::from(!kind.simple);
+        if !kind.fan {
+            not_fans.push((face as u32, corners.to_vec()));
         }
         self.mesh.n_polygons += 1;
         Ok(())

@@ -1,16 +1,20 @@
-//! Wavefront OBJ: its `v` and `f` statements, read by `tobj`.
+//! Wavefront OBJ: its `v` and `f` (formerly `fo`) statements, read by `tobj`.
 //!
 //! Only these two statements reach `tobj`, one clean line each, because given a whole file it
 //! - counts polylines (`l a b c`) as polygons and splits the polygons over groups and materials,
 //! - numbers vertices by first use and forgets the others,
 //! - knows neither continued lines nor comments behind a statement.
 //!
+//! Other geometry (lines, points, curves, surfaces, other files) and unknown statements are
+//! counted. A comment ends with its line, even if it ends in a backslash: a path in a comment must
+//! not swallow a face; since some programs have it otherwise, these are counted, too.
+//!
 //! A first polygon that names all vertices makes it keep the numbers of the file. Groups, objects and
 //! materials do not reorder anything. A vertex's weight or colour and a corner's texture and normal indices
 //! are not geometry and are left out. A face may name vertices that come after it, as many writers have
 //! it; a negative index counts back from the last vertex before the face.
 
-use super::text::{Lines, before_comment, number, words};
+use super::text::{Lines, before_comment, n_mixed_ends, number, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
 use std::io::Read as _;
@@ -22,6 +26,48 @@ const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
     ignore_lines: false,
 };
 
+/// Statements without a surface of their own: attributes of vertices, groups, states, and what
+/// belongs to a curve or surface that is counted by itself.
+const WITHOUT_SURFACE: [&[u8]; 37] = [
+    b"vt",
+    b"vn",
+    b"vp",
+    b"g",
+    b"s",
+    b"o",
+    b"mg",
+    b"usemtl",
+    b"mtllib",
+    b"usemap",
+    b"maplib",
+    b"bevel",
+    b"c_interp",
+    b"d_interp",
+    b"lod",
+    b"shadow_obj",
+    b"trace_obj",
+    b"ctech",
+    b"stech",
+    b"deg",
+    b"bmat",
+    b"step",
+    b"cstype",
+    b"parm",
+    b"trim",
+    b"hole",
+    b"scrv",
+    b"sp",
+    b"end",
+    b"con",
+    b"res",
+    b"vc",
+    b"vw",
+    b"cstyle",
+    b"texture",
+    b"xf",
+    b"matlib",
+];
+
 /// The geometry of a file, as lines for `tobj`.
 #[derive(Default)]
 struct Geometry {
@@ -30,6 +76,9 @@ struct Geometry {
     lines: Vec<usize>,
     n_vertices: usize,
     n_faces: usize,
+    n_tolerated: usize,
+    n_unread: usize,
+    first_unread: Option<(usize, String)>,
 }
 
 impl Geometry {
@@ -38,11 +87,16 @@ impl Geometry {
         let mut joined: Vec<u8> = Vec::new();
         let mut first_line = 1;
         for (number, line) in Lines::new(bytes) {
+            let statement = before_comment(line);
             let line = line.trim_ascii_end();
             if joined.is_empty() {
                 first_line = number;
             }
-            if let Some(head) = line.strip_suffix(b"\\") {
+            let continued = line.strip_suffix(b"\\");
+            let in_comment = statement.len() < line.len();
+            geometry.n_tolerated += usize::from(in_comment && continued.is_some());
+            let line = if in_comment { statement } else { line };
+            if let Some(head) = continued.filter(|_| !in_comment) {
                 joined.extend_from_slice(head);
                 joined.push(b' ');
             } else if joined.is_empty() {
@@ -58,7 +112,7 @@ impl Geometry {
     }
 
     fn push(&mut self, statement: &[u8], line: usize) -> Result<(), ParseError> {
-        let mut words = words(before_comment(statement));
+        let mut words = words(statement);
         match words.next() {
             Some(b"v") => {
                 self.text.push(b'v');
@@ -68,12 +122,17 @@ impl Geometry {
                     found += 1;
                 }
                 if found < 3 {
-                    return Err(ParseError::ShortVertex { line, found });
+                    return Err(ParseError::ShortVertex {
+                        line,
+                        found,
+                        needed: 3,
+                    });
                 }
                 self.n_vertices += 1;
             }
-            Some(b"f") => {
+            Some(keyword @ (b"f" | b"fo")) => {
                 let face = self.n_faces;
+                self.n_tolerated += usize::from(keyword == b"fo");
                 self.text.push(b'f');
                 let mut corners = 0;
                 for word in words {
@@ -90,7 +149,15 @@ impl Geometry {
                 }
                 self.n_faces += 1;
             }
-            _ => return Ok(()),
+            None => return Ok(()),
+            Some(keyword) => {
+                if !WITHOUT_SURFACE.contains(&keyword) {
+                    self.n_unread += 1;
+                    let first = || (line, shown(statement.trim_ascii()));
+                    self.first_unread.get_or_insert_with(first);
+                }
+                return Ok(());
+            }
         }
         self.text.push(b'\n');
         self.lines.push(line);
@@ -149,7 +216,14 @@ impl Geometry {
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let geometry = Geometry::of(bytes)?;
     if geometry.n_faces == 0 {
-        return Err(ParseError::NoFaces);
+        return Err(match geometry.first_unread {
+            None => ParseError::NoFaces,
+            Some((line, found)) => ParseError::OnlyUnread {
+                n_unread: geometry.n_unread,
+                line,
+                found,
+            },
+        });
     }
     let mut all_vertices = String::from("f");
     for vertex in 1..=geometry.n_vertices {
@@ -169,6 +243,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let mesh = &model.mesh;
     let (positions, _) = mesh.positions.as_chunks::<3>();
     let mut polygons = Polygons::new(positions.to_vec());
+    polygons.mesh.findings.n_tolerated_statements = geometry.n_tolerated + n_mixed_ends(bytes);
+    polygons.mesh.findings.n_unread_statements = geometry.n_unread;
     // No arities means triangles only.
     let arities = mesh.face_arities.iter().map(|&n| n as usize);
     let triangles = std::iter::repeat_n(3, mesh.indices.len() / 3);

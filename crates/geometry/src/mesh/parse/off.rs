@@ -1,17 +1,21 @@
-//! Object File Format: `OFF` and its variants with colours, normals and texture coordinates.
+//! Object File Format: `OFF` and its variants with colours, normals, texture coordinates and other
+//! dimensions.
 //!
 //! One vertex and one face a line, as every writer has it: only so can the optional values behind a
 //! vertex or a face be told from what follows. Counts are checked against the bytes before anything is
 //! allocated.
 
-use super::text::{Lines, before_comment, number, position, words};
+use super::text::{Lines, before_comment, n_mixed_ends, number, position, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
 
 /// Shortest line of a vertex, `0 0 0`, and of a face, `1 0`, with their line end.
 const MIN_VERTEX_BYTES: usize = 6;
 const MIN_FACE_BYTES: usize = 4;
-const TEXT: &str = "only text in three dimensions";
+/// What may stand before the keyword, each once: texture coordinates, colours, normals, a fourth
+/// coordinate, and a number of dimensions. Geomview wants them in this order, MeshLab writes them
+/// in another one.
+const PREFIXES: [&[u8]; 5] = [b"ST", b"C", b"N", b"4", b"n"];
 
 /// Lines with their numbers, without comments and empty ones.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
@@ -20,47 +24,67 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
         .filter(|(_, line)| words(line).next().is_some())
 }
 
-/// What follows the keyword on its line: counts, or nothing. `None` when the line is no header, as in
-/// files that begin with their counts.
-fn after_keyword<'a>(words: &[&'a [u8]]) -> Result<Option<Vec<&'a [u8]>>, ParseError> {
+/// What the keyword says of the vertices.
+#[derive(Default)]
+struct Keyword {
+    /// Whether a fourth, homogeneous coordinate follows the others.
+    homogeneous: bool,
+    /// Whether the header gives the number of dimensions before the counts.
+    dimensions: bool,
+}
+
+/// What the first line says, and what follows the keyword on it: counts, or nothing. Files may
+/// begin with their counts.
+fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseError> {
     let first = words[0];
     let Some(at) = first.windows(3).position(|w| w == b"OFF") else {
         return if first[0].is_ascii_digit() {
-            Ok(None)
+            Ok((Keyword::default(), words.to_vec()))
         } else {
             Err(bad_header(first))
         };
     };
-    let prefix = &first[..at];
-    if prefix.iter().any(|b| matches!(b, b'4' | b'n')) {
-        return Err(ParseError::Unsupported {
-            what: format!("{} with other dimensions", shown(first)),
-            instead: TEXT,
-        });
+    let mut left = PREFIXES.to_vec();
+    let mut prefix = &first[..at];
+    while !prefix.is_empty() {
+        let known = left.iter().position(|known| prefix.starts_with(known));
+        let known = left.swap_remove(known.ok_or_else(|| bad_header(first))?);
+        prefix = &prefix[known.len()..];
     }
-    let rest = prefix.strip_prefix(b"ST").unwrap_or(prefix);
-    let rest = rest.strip_prefix(b"C").unwrap_or(rest);
-    let rest = rest.strip_prefix(b"N").unwrap_or(rest);
-    if !rest.is_empty() {
-        return Err(bad_header(first));
-    }
+    let keyword = Keyword {
+        homogeneous: !left.contains(&&b"4"[..]),
+        dimensions: !left.contains(&&b"n"[..]),
+    };
     // Some writers leave out the line end: `OFF490 518 0`.
-    let glued = &first[at + 3..];
-    let mut counts = Vec::new();
-    if !glued.is_empty() {
-        counts.push(glued);
-    }
-    counts.extend_from_slice(&words[1..]);
-    if counts
+    let glued = Some(&first[at + 3..]).filter(|glued| !glued.is_empty());
+    let rest: Vec<&[u8]> = glued
+        .into_iter()
+        .chain(words[1..].iter().copied())
+        .collect();
+    if rest
         .first()
         .is_some_and(|w| w.eq_ignore_ascii_case(b"BINARY"))
     {
         return Err(ParseError::Unsupported {
             what: "binary OFF".into(),
-            instead: TEXT,
+            instead: "save it as text",
         });
     }
-    Ok(Some(counts))
+    Ok((keyword, rest))
+}
+
+impl Keyword {
+    /// Whether a vertex has a homogeneous coordinate beside the dimensions that the header gives,
+    /// which must be 3.
+    fn is_homogeneous(&self, (line, dimensions): (usize, &[u8])) -> Result<bool, ParseError> {
+        match number::<u64>(line, dimensions)? {
+            3 => Ok(self.homogeneous),
+            n => Err(ParseError::Unsupported {
+                what: format!("OFF with {n} dimensions"),
+                instead: "save it with 3",
+            }),
+        }
+    }
 }
 
 /// The count a header declares, refused when the file is too short to hold it.
@@ -93,23 +117,26 @@ fn bad_header(found: &[u8]) -> ParseError {
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let mut lines = lines(bytes);
-    let Some((mut line, first)) = lines.next() else {
+    let Some((line, first)) = lines.next() else {
         return Err(bad_header(b""));
     };
     let first: Vec<&[u8]> = words(first).collect();
-    let mut counts = match after_keyword(&first)? {
-        None => first,
-        Some(counts) => counts,
-    };
-    if counts.is_empty() {
-        let next = lines.next().ok_or(ParseError::NoFaces)?;
-        (line, counts) = (next.0, words(next.1).collect());
+    let (keyword, rest) = keyword(&first)?;
+    let mut header: Vec<(usize, &[u8])> = rest.into_iter().map(|word| (line, word)).collect();
+    // The number of edges, which nobody needs, may be left out at the end of a line, but no count
+    // before it.
+    let needed = 2 + usize::from(keyword.dimensions);
+    while header.len() < needed {
+        let (line, text) = lines.next().ok_or(ParseError::NoFaces)?;
+        header.extend(words(text).map(|word| (line, word)));
     }
-    let Some(&[vertices, faces]) = counts.first_chunk::<2>() else {
-        return Err(bad_header(counts[0]));
+    let homogeneous = match keyword.dimensions {
+        true => keyword.is_homogeneous(header.remove(0))?,
+        false => keyword.homogeneous,
     };
-    let n_vertices = count("vertices", (line, vertices), bytes.len(), MIN_VERTEX_BYTES)?;
-    let n_faces = count("faces", (line, faces), bytes.len(), MIN_FACE_BYTES)?;
+    let (vertices, faces) = (header[0], header[1]);
+    let n_vertices = count("vertices", vertices, bytes.len(), MIN_VERTEX_BYTES)?;
+    let n_faces = count("faces", faces, bytes.len(), MIN_FACE_BYTES)?;
 
     let mut positions = Vec::with_capacity(n_vertices);
     while positions.len() < n_vertices {
@@ -118,10 +145,23 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
             declared: n_vertices as u64,
             found: positions.len() as u64,
         })?;
-        positions.push(position(line, &mut words(text))?);
+        let mut words = words(text);
+        let mut position = position(line, &mut words)?;
+        if homogeneous {
+            let word = words.next();
+            let word = word.ok_or(ParseError::ShortVertex {
+                line,
+                found: 3,
+                needed: 4,
+            })?;
+            let w: f64 = number(line, word)?;
+            position = position.map(|x| x / w);
+        }
+        positions.push(position);
     }
 
     let mut polygons = Polygons::new(positions);
+    polygons.mesh.findings.n_tolerated_statements = n_mixed_ends(bytes);
     let mut corners = Vec::new();
     for face in 0..n_faces {
         let (line, text) = lines.next().ok_or(ParseError::Truncated {

@@ -3,11 +3,12 @@
 //! Header and binary rows are read by `ply-rs-bw`, rows of text here: its grammar has no `1.`, `.5` or
 //! `nan`, and none of a row's place. Of the element `vertex` its `x y z`, of the element `face` its list
 //! `vertex_indices` (or `vertex_index`) is read, whatever the types; other properties and elements are
-//! skipped. A text has a row a line, and what a line holds beyond its properties is left out, because some
-//! writers put there what their header does not declare. Counts are checked against the bytes before
+//! skipped. A text has a row a line, and what a line holds beyond its properties is left out,
+//! because some writers put there what their header does not declare. Rows of triangle strips and
+//! of edges are counted as unread beside faces. Counts are checked against the bytes before
 //! anything is allocated.
 
-use super::text::{number, words};
+use super::text::{first_line, number, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
 use crate::mesh::ParsedMesh;
 use ply_rs_bw::parser::{Parser, Reader};
@@ -73,8 +74,9 @@ impl PropertyAccess for Row {
     }
 }
 
-/// The next line and the bytes it takes with its end: LF, CR LF, or CR alone where `cr` says so.
-fn line(rest: &[u8], cr: bool) -> (&[u8], usize) {
+/// The next line of a header and the bytes it takes with its end: LF, CR LF, or CR alone where `cr`
+/// says so. A binary body may begin with a byte like LF.
+fn header_line(rest: &[u8], cr: bool) -> (&[u8], usize) {
     let end = if cr { b'\r' } else { b'\n' };
     let length = rest.iter().position(|&b| b == end);
     let text = &rest[..length.unwrap_or(rest.len())];
@@ -87,8 +89,6 @@ struct Body<'a> {
     encoding: Encoding,
     /// Number of the line that was read last.
     line: usize,
-    /// Whether lines end in CR alone.
-    cr: bool,
 }
 
 /// The header, and what follows it.
@@ -110,7 +110,7 @@ fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
                 what: "line end_header: the file is cut off within its header",
             });
         }
-        let (text, taken) = line(rest, cr);
+        let (text, taken) = header_line(rest, cr);
         rest = &rest[taken..];
         let keyword = words(text).next().unwrap_or_default();
         n_elements += usize::from(keyword == b"element");
@@ -158,7 +158,6 @@ fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
         rest,
         encoding: header.encoding,
         line: lines.len(),
-        cr,
     };
     Ok((header, body))
 }
@@ -193,10 +192,10 @@ impl Body<'_> {
             if self.rest.is_empty() {
                 return Ok(None);
             }
-            let (text, taken) = line(self.rest, self.cr);
+            let (text, taken) = first_line(self.rest);
             self.rest = &self.rest[taken..];
             self.line += 1;
-            if !text.is_empty() {
+            if !text.trim_ascii().is_empty() {
                 break text;
             }
         };
@@ -350,6 +349,9 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         check_count(element, body.encoding, body.rest.len())?;
         if element.name == "vertex" {
             polygons.mesh.vertices.reserve_exact(element.count);
+        }
+        if ["tristrips", "edge"].contains(&element.name.as_str()) {
+            polygons.mesh.findings.n_unread_statements += element.count;
         }
         for index in 0..element.count {
             let Some(row) = body.row(element, index)? else {

@@ -99,13 +99,14 @@ fn ply_text_as_it_is_found() {
 fn ply_errors_name_the_place_and_the_value() {
     let with = |from: &str, to: &str| format!("ply\nformat ascii 1.0\n{}", BODY.replace(from, to));
     for (text, message) in [
-        (
-            "".to_owned(),
-            "the file begins with \"\", which is not a PLY header",
-        ),
+        ("".to_owned(), "the file is empty"),
         (
             "OFF\n".to_owned(),
-            "the file begins with \"OFF\", which is not a PLY header",
+            "the file is an OFF mesh, not a PLY mesh: name it .off",
+        ),
+        (
+            "Ply\n".to_owned(),
+            "the file begins with \"Ply\", which is not a PLY header",
         ),
         (
             "ply\nformat ascii 1.0\nelement vertex 3\n".to_owned(),
@@ -255,9 +256,10 @@ fn stl_errors_name_the_place_and_the_value() {
     let mut empty = vec![0; 84];
     empty[0] = b'x';
     for (bytes, message) in [
+        (b"".to_vec(), "the file is empty"),
         (
-            b"".to_vec(),
-            "the file begins with \"\", which is not an STL header",
+            b"mesh\n".to_vec(),
+            "the file begins with \"mesh\", which is not an STL header",
         ),
         (
             named,
@@ -294,4 +296,37 @@ fn stl_errors_name_the_place_and_the_value() {
         assert_eq!(stl(&bytes).unwrap_err().to_string(), message);
     }
     assert!(stl(&binary).is_err(), "one byte too many");
+}
+
+#[test]
+fn text_stl_may_have_several_statements_on_a_line() {
+    let [text, _] = stl_samples();
+    let plain = stl(&text).unwrap();
+    let text = String::from_utf8(text).unwrap();
+    let facets = text.split_once('\n').unwrap().1.replace('\n', " ");
+    for (text, n) in [
+        (text.replace("endloop\n  endfacet", "endloop endfacet"), 2),
+        (text.replace("0 0 1\n    outer", "0 0 1 outer"), 2),
+        (text.replace("0 0 1\n", "-nan(ind) nan nan\n"), 0),
+        // The name ends where a facet begins with its normal.
+        (format!("solid a facet {facets}"), 15),
+        (format!("solid a facet\n{facets}\n"), 14),
+    ] {
+        let mesh = stl(text.as_bytes()).unwrap_or_else(|e| panic!("{text}: {e}"));
+        assert_eq!(mesh.triangles, plain.triangles, "{text}");
+        assert_eq!(mesh.vertices, plain.vertices, "{text}");
+        assert_eq!(mesh.findings.n_tolerated_statements, n, "{text}");
+        assert_eq!(mesh.findings.n_unread_statements, 0, "{text}");
+    }
+    let coloured = text.replacen("vertex 0.5 0.25 0\n", "vertex 0.5 0.25 0 255 0 0\n", 1);
+    let mesh = stl(coloured.as_bytes()).unwrap();
+    assert_eq!(mesh.vertices, plain.vertices);
+    assert_eq!(mesh.findings.n_unread_statements, 1);
+    // Words that are no statement begin a line: which of them are geometry nobody knows.
+    assert_eq!(
+        stl(text.replacen("endfacet", "end facet", 1).as_bytes())
+            .unwrap_err()
+            .to_string(),
+        "line 8: \"end facet\" is no line of a text STL"
+    );
 }

@@ -1,11 +1,14 @@
 //! STL, text and binary: triangles (in text, any polygons) that share no vertices.
 //!
+//! Text is read word by word, since some writers put a facet or a whole file on one line. Words
+//! behind a statement on its line that are no keyword, such as a colour, are counted as unread.
+//!
 //! A file is binary if its length is the one that its count of triangles gives, or if it does not begin
 //! with `solid`: some binary files do begin so. Corners at equal positions become one vertex when the
 //! mesh is cleaned.
 
-use super::text::{Lines, position, words};
-use super::{MAX_CORNERS, ParseError, Polygons, shown};
+use super::text::{Lines, n_mixed_ends, number, position, words};
+use super::{MAX_CORNERS, ParseError, Polygons, as_utf8, shown};
 use crate::mesh::ParsedMesh;
 
 /// Bytes before the triangles of a binary file, of which the last four are their number.
@@ -18,12 +21,13 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         .first_chunk::<HEADER>()
         .and_then(|header| header.last_chunk::<4>())
         .map(|count| u32::from_le_bytes(*count) as usize);
-    let is_text = words(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
+    let as_text = as_utf8(bytes);
+    let is_text = words(&as_text)
         .next()
         .is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
     match declared {
         Some(n) if n.checked_mul(TRIANGLE) == Some(bytes.len() - HEADER) => binary(bytes),
-        _ if is_text => text(bytes),
+        _ if is_text => text(&as_text),
         Some(n) => Err(ParseError::StlLength {
             declared: n,
             expected: n as u64 * TRIANGLE as u64 + HEADER as u64,
@@ -53,29 +57,83 @@ fn binary(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     polygons.finish()
 }
 
+/// What a statement of a text begins with.
+const KEYWORDS: [&str; 7] = [
+    "solid", "facet", "outer", "vertex", "endloop", "endfacet", "endsolid",
+];
+
+fn is(word: &[u8], keyword: &str) -> bool {
+    word.eq_ignore_ascii_case(keyword.as_bytes())
+}
+
+fn is_keyword(word: &[u8]) -> bool {
+    KEYWORDS.iter().any(|keyword| is(word, keyword))
+}
+
+/// A text while it is read.
+struct Text {
+    polygons: Polygons,
+    /// First vertex of the loop that is open.
+    open: Option<usize>,
+    solid: bool,
+}
+
 fn text(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
-    let mut polygons = Polygons::new(Vec::new());
-    // First vertex of the loop that is open.
-    let mut open = None;
-    let mut solid = false;
+    let mut reader = Text {
+        polygons: Polygons::new(Vec::new()),
+        open: None,
+        solid: false,
+    };
+    reader.polygons.mesh.findings.n_tolerated_statements = n_mixed_ends(bytes);
+    let mut statements = Vec::new();
     for (line, text) in Lines::new(bytes) {
-        let mut words = words(text);
-        let Some(keyword) = words.next() else {
-            continue;
-        };
-        let bad = || ParseError::BadLine {
-            line,
-            found: shown(text.trim_ascii()),
-            what: "text STL",
-        };
+        statements.clear();
+        statements.extend(words(text));
+        reader.line(line, &statements)?;
+    }
+    if reader.solid || reader.open.is_some() {
+        return Err(ParseError::Missing {
+            what: "line endsolid: it is cut off",
+        });
+    }
+    reader.polygons.finish()
+}
+
+impl Text {
+    fn line(&mut self, line: usize, words: &[&[u8]]) -> Result<(), ParseError> {
+        let mut at = 0;
+        let mut unread = false;
+        while at < words.len() {
+            let findings = &mut self.polygons.mesh.findings;
+            if at > 0 && !is_keyword(words[at]) {
+                unread = true;
+                at += 1;
+                continue;
+            }
+            findings.n_tolerated_statements += usize::from(at > 0);
+            at += self.statement(line, words, at)?;
+        }
+        self.polygons.mesh.findings.n_unread_statements += usize::from(unread);
+        Ok(())
+    }
+
+    /// Reads the statement that begins at a word, and says how many words it has.
+    fn statement(&mut self, line: usize, words: &[&[u8]], at: usize) -> Result<usize, ParseError> {
+        let polygons = &mut self.polygons;
         let n_vertices = polygons.mesh.vertices.len();
         let face = polygons.mesh.n_polygons;
-        match (keyword.to_ascii_lowercase().as_slice(), open) {
+        let keyword = words[at].to_ascii_lowercase();
+        let rest = &words[at + 1..];
+        Ok(match (keyword.as_slice(), self.open) {
             (b"vertex", Some(_)) => {
-                let position = position(line, &mut words)?;
+                let position = position(line, &mut rest.iter().copied())?;
                 polygons.mesh.vertices.push(position);
+                4
             }
-            (b"outer", None) => open = Some(n_vertices),
+            (b"outer", None) => {
+                self.open = Some(n_vertices);
+                1 + usize::from(rest.first().is_some_and(|word| is(word, "loop")))
+            }
             (b"endloop", Some(first)) => {
                 let corners: Vec<u32> = (first as u32..n_vertices as u32).collect();
                 if corners.is_empty() {
@@ -88,18 +146,35 @@ fn text(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
                     });
                 }
                 polygons.push(&corners)?;
-                open = None;
+                self.open = None;
+                1
             }
-            (b"solid", None) => solid = true,
-            (b"endsolid", None) => solid = false,
-            (b"facet" | b"endfacet", None) => {}
-            _ => return Err(bad()),
-        }
+            // A normal follows, in whatever words: it is not read.
+            (b"facet", None) => {
+                let normal = rest.iter().position(|word| is_keyword(word));
+                1 + normal.unwrap_or(rest.len())
+            }
+            (b"endfacet", None) => 1,
+            (b"solid" | b"endsolid", None) => {
+                self.solid = keyword == b"solid";
+                1 + name(line, rest)
+            }
+            _ => {
+                return Err(ParseError::BadLine {
+                    line,
+                    found: shown(&words.join(&b' ')),
+                    what: "text STL",
+                });
+            }
+        })
     }
-    if solid || open.is_some() {
-        return Err(ParseError::Missing {
-            what: "line endsolid: it is cut off",
-        });
-    }
-    polygons.finish()
+}
+
+/// Words of the name behind `solid` or `endsolid`. It may have any words and ends with its line, or
+/// where a facet begins with its normal.
+fn name(line: usize, rest: &[&[u8]]) -> usize {
+    let facet = |words: &[&[u8]]| {
+        is(words[0], "facet") && is(words[1], "normal") && number::<f64>(line, words[2]).is_ok()
+    };
+    rest.windows(3).position(facet).unwrap_or(rest.len())
 }

@@ -11,7 +11,7 @@ pub(super) struct Lines<'a> {
 impl<'a> Lines<'a> {
     pub(super) fn new(bytes: &'a [u8]) -> Self {
         Self {
-            rest: Some(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)),
+            rest: Some(bytes),
             number: 0,
         }
     }
@@ -23,10 +23,40 @@ impl<'a> Iterator for Lines<'a> {
     fn next(&mut self) -> Option<Self::Item> {
         let rest = self.rest?;
         self.number += 1;
-        let end = rest.iter().position(|&b| b == b'\n');
-        self.rest = end.map(|end| &rest[end + 1..]);
-        Some((self.number, &rest[..end.unwrap_or(rest.len())]))
+        let (line, taken) = first_line(rest);
+        self.rest = (taken > line.len()).then(|| &rest[taken..]);
+        Some((self.number, line))
     }
+}
+
+/// The first line without its end, and the bytes that it takes with it. A line ends in LF, in CR
+/// LF, in CR CR LF (a text that was converted twice), or in CR alone.
+pub(super) fn first_line(text: &[u8]) -> (&[u8], usize) {
+    let Some(end) = text.iter().position(|b| matches!(b, b'\n' | b'\r')) else {
+        return (text, text.len());
+    };
+    let n = match &text[end..] {
+        [b'\r', b'\r', b'\n', ..] => 3,
+        [b'\r', b'\n', ..] => 2,
+        _ => 1,
+    };
+    (&text[..end], end + n)
+}
+
+/// Lines that end in CR alone, in a text that also has LF: the first release took such a CR for a
+/// space.
+pub(super) fn n_mixed_ends(text: &[u8]) -> usize {
+    if !text.contains(&b'\r') || !text.contains(&b'\n') {
+        return 0;
+    }
+    let mut n = 0;
+    let mut rest = text;
+    while !rest.is_empty() {
+        let (line, taken) = first_line(rest);
+        n += usize::from(&rest[line.len()..taken] == b"\r");
+        rest = &rest[taken..];
+    }
+    n
 }
 
 /// What comes before the first `#`.
@@ -59,9 +89,11 @@ pub(super) fn position<'a>(
 ) -> Result<[f64; 3], ParseError> {
     let mut position = [0.0; 3];
     for (found, x) in position.iter_mut().enumerate() {
-        let word = words
-            .next()
-            .ok_or(ParseError::ShortVertex { line, found })?;
+        let word = words.next().ok_or(ParseError::ShortVertex {
+            line,
+            found,
+            needed: 3,
+        })?;
         *x = number(line, word)?;
     }
     Ok(position)

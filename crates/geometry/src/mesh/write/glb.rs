@@ -2,8 +2,10 @@
 //!
 //! All primitives share one list of positions. Triangles are grouped by label, so each primitive says in
 //! its `extras` which polygons of the input it has, as first and count of each run of consecutive ones.
+//! The triangles of a polygon are those of [`Triangulator`], on which its label was computed.
 
 use super::{append, by_label, runs};
+use crate::mesh::Triangulator;
 use std::fmt::Write as _;
 
 /// Sizes beyond which single precision would overflow or lose digits.
@@ -107,15 +109,14 @@ pub fn glb<P: AsRef<[u32]>>(
         triple(high.map(f64::from)),
     );
     let (mut primitives, mut materials) = (String::new(), String::new());
+    let mut triangulator = Triangulator::default();
     for (i, (label, members)) in by_label(labels).into_iter().enumerate() {
         let start = binary.len();
         for &polygon in &members {
             let corners = polygons[polygon as usize].as_ref();
-            let last = corners.len() - 1;
-            for c in 1..=corners.len().saturating_sub(2).max(1) {
-                let triangle = [corners[0], corners[c.min(last)], corners[(c + 1).min(last)]];
+            triangulator.triangulate(vertices, corners, |triangle| {
                 binary.extend(triangle.iter().flat_map(|v| v.to_le_bytes()));
-            }
+            });
         }
         let n_bytes = binary.len() - start;
         append(

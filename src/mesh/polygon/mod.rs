@@ -1,0 +1,316 @@
+//! A polygon becomes triangles that cover it: its fan from the first corner where that does, else a
+//! constrained Delaunay triangulation of its projection onto its own plane.
+//!
+//! The fan comes first because it is what a convex polygon needs, and costs one pass. The Delaunay
+//! triangulation keeps every corner, also those on a straight line, which the neighbours of the
+//! polygon may share, and makes no slivers there; its predicates are exact. A polygon with a hole,
+//! which a bridge joins to the outer ring, is one polygon that passes the bridge twice: the inside
+//! is where the winding number is 1. A polygon that crosses itself or has no area keeps its fan,
+//! and the caller is told.
+
+use super::{cross, dot, norm, sub};
+use spade::handles::FixedVertexHandle;
+use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
+use std::collections::HashMap;
+use std::f64::consts::TAU;
+
+/// A polygon whose corners leave its plane by more than this share of its size is not planar: below
+/// it, how it is triangulated changes its area by less than a thousandth.
+const PLANAR: f64 = 0.01;
+/// A polygon with less area than this share of its size squared has no plane, as cleaning has it.
+const MIN_AREA: f64 = 1e-12;
+/// A fan may fold over itself by this share of the area: corners on a line, in files of six digits.
+const FOLD: f64 = 1e-6;
+
+/// A corner farther than this from an edge, in units of the polygon's size, does not lie on it.
+const ASIDE: f64 = 1e-6;
+
+type Plane = ConstrainedDelaunayTriangulation<Point2<f64>>;
+
+/// What a polygon turned out to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PolygonKind {
+    /// Whether its corners lie in a plane.
+    pub planar: bool,
+    /// Whether it has an area and does not cross itself. Otherwise its triangles are its fan,
+    /// whatever that is.
+    pub simple: bool,
+    /// Whether its triangles are its fan from the first corner.
+    pub fan: bool,
+}
+
+/// Triangulates polygons; holds memory that the next one uses again.
+#[derive(Debug, Default)]
+pub struct Triangulator {
+    /// Corners from the first one, then in the plane of the polygon; in units of its size.
+    local: Vec<[f64; 3]>,
+    flat: Vec<[f64; 2]>,
+}
+
+impl Triangulator {
+    /// Gives `out` the triangles of a polygon: `corners.len() - 2` of them, or one degenerate
+    /// triangle if there are fewer than three corners; in the polygon's orientation. The same
+    /// positions always give the same.
+    ///
+    /// O(n log n) for ordinary polygons.
+    ///
+    /// # Panics
+    /// If there are no corners.
+    pub fn triangulate(
+        &mut self,
+        vertices: &[[f64; 3]],
+        corners: &[u32],
+        mut out: impl FnMut([u32; 3]),
+    ) -> PolygonKind {
+        let mut kind = PolygonKind {
+            planar: true,
+            simple: true,
+            fan: true,
+        };
+        if corners.len() > 3 {
+            match self.flatten(vertices, corners) {
+                None => kind.simple = false,
+                Some(planar) => {
+                    kind.planar = planar;
+                    kind.fan = fan_covers(&self.flat);
+                }
+            }
+        }
+        if !kind.fan {
+            let at = |t: [usize; 3]| t.map(|c| corners[c]);
+            let found = match corners.len() {
+                4 => other_diagonal(&self.flat),
+                _ => delaunay(&self.flat, &self.local),
+            };
+            match found {
+                Some(triangles) => triangles.into_iter().for_each(|t| out(at(t))),
+                None => (kind.simple, kind.fan) = (false, true),
+            }
+        }
+        if kind.fan {
+            fan(corners).for_each(out);
+        }
+        kind
+    }
+
+    /// Projects a polygon onto the plane of its Newell normal; whether it was in it, `None` if
+    /// there is none.
+    fn flatten(&mut self, vertices: &[[f64; 3]], corners: &[u32]) -> Option<bool> {
+        let position = |v: u32| vertices[v as usize];
+        let first = position(corners[0]);
+        self.local.clear();
+        self.local
+            .extend(corners.iter().map(|&v| sub(position(v), first)));
+        let span = self
+            .local
+            .iter()
+            .flatten()
+            .fold(0.0, |s: f64, x| s.max(x.abs()));
+        if span == 0.0 || !span.is_finite() {
+            return None;
+        }
+        for p in &mut self.local {
+            *p = p.map(|x| x / span);
+        }
+        let mut normal = [0.0; 3];
+        for (i, &p) in self.local.iter().enumerate() {
+            let next = self.local[(i + 1) % self.local.len()];
+            let part = cross(p, next);
+            normal = std::array::from_fn(|i| normal[i] + part[i]);
+        }
+        let doubled = norm(normal);
+        // Written so that a NaN has no plane.
+        if !(doubled > MIN_AREA) {
+            return None;
+        }
+        let normal = normal.map(|x| x / doubled);
+        // The axis that is farthest from the normal, so that planes along axes are projected
+        // exactly.
+        let least = (0..3).fold(0, |l, i| {
+            if normal[i].abs() < normal[l].abs() {
+                i
+            } else {
+                l
+            }
+        });
+        let mut axis = [0.0; 3];
+        axis[least] = 1.0;
+        let v = cross(normal, axis);
+        let length = norm(v);
+        let v = v.map(|x| x / length);
+        let u = cross(v, normal);
+        self.flat.clear();
+        // Adding zero makes -0 and 0 one.
+        self.flat.extend(
+            self.local
+                .iter()
+                .map(|&p| [dot(p, u) + 0.0, dot(p, v) + 0.0]),
+        );
+        let extent = |values: &mut dyn Iterator<Item = f64>| {
+            let ends = |(low, high): (f64, f64), x: f64| (low.min(x), high.max(x));
+            let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), ends);
+            high - low
+        };
+        let height = extent(&mut self.local.iter().map(|&p| dot(p, normal)));
+        let width = extent(&mut self.flat.iter().map(|p| p[0]));
+        let depth = extent(&mut self.flat.iter().map(|p| p[1]));
+        Some(height <= PLANAR * width.hypot(depth))
+    }
+}
+
+/// The fan of a polygon from its first corner; one degenerate triangle for one or two corners.
+fn fan(corners: &[u32]) -> impl Iterator<Item = [u32; 3]> {
+    let last = corners.len() - 1;
+    (1..=corners.len().saturating_sub(2).max(1))
+        .map(move |i| [corners[0], corners[i.min(last)], corners[(i + 1).min(last)]])
+}
+
+fn cross_2(a: [f64; 2], b: [f64; 2]) -> f64 {
+    a[0] * b[1] - a[1] * b[0]
+}
+
+/// Whether the fan from the first corner, at the origin, covers a polygon once: all its triangles
+/// turn the same way, and not more than once around.
+fn fan_covers(flat: &[[f64; 2]]) -> bool {
+    let away = |p: &&[f64; 2]| **p != [0.0, 0.0];
+    let spokes: Vec<&[f64; 2]> = match flat[1..].iter().position(|p| away(&p)) {
+        None => return false,
+        Some(begin) => {
+            let end = flat.iter().rposition(|p| away(&p)).unwrap_or(begin);
+            flat[begin + 1..=end].iter().collect()
+        }
+    };
+    // The polygon comes back to its first corner: a hole or another lobe begins there.
+    if !spokes.iter().all(away) {
+        return false;
+    }
+    let (mut area, mut folded, mut angle) = (0.0, 0.0, 0.0);
+    for pair in spokes.windows(2) {
+        let (a, b) = (*pair[0], *pair[1]);
+        let turned = cross_2(a, b);
+        area += turned;
+        folded -= turned.min(0.0);
+        angle += turned.max(0.0).atan2(a[0] * b[0] + a[1] * b[1]);
+    }
+    folded <= FOLD * area && angle <= TAU
+}
+
+/// The triangles of a quad whose reflex corner faces the diagonal of its fan.
+fn other_diagonal(flat: &[[f64; 2]]) -> Option<Vec<[usize; 3]>> {
+    let triangles = [[1, 2, 3], [1, 3, 0]];
+    let positive = |t: &[usize; 3]| {
+        let [a, b, c] = t.map(|i| flat[i]);
+        cross_2([b[0] - a[0], b[1] - a[1]], [c[0] - a[0], c[1] - a[1]]) >= 0.0
+    };
+    triangles.iter().all(positive).then(|| triangles.to_vec())
+}
+
+/// The triangles of a polygon that does not cross itself, as positions in it.
+fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
+    let (plane, ring, corner_of) = points(flat, local)?;
+    let place = |point: usize| local[corner_of[point]];
+    let (plane, passes) = edges(plane, &ring, place)?;
+    let passes_of = |from: usize, to: usize| passes.get(&(from, to)).copied().unwrap_or(0);
+    // The winding number of each face, from the outside inwards.
+    let mut winding: Vec<Option<i32>> = vec![None; plane.num_all_faces()];
+    winding[plane.outer_face().index()] = Some(0);
+    let mut todo: Vec<_> = plane.convex_hull().collect();
+    while let Some(edge) = todo.pop() {
+        let (Some(here), inner) = (winding[edge.face().index()], edge.rev().face()) else {
+            continue;
+        };
+        if winding[inner.index()].is_some() {
+            continue;
+        }
+        let (from, to) = (edge.from().index(), edge.to().index());
+        let there = here + passes_of(to, from) - passes_of(from, to);
+        if !(0..=1).contains(&there) {
+            return None;
+        }
+        winding[inner.index()] = Some(there);
+        todo.extend(inner.as_inner()?.adjacent_edges());
+    }
+    let inside = plane
+        .inner_faces()
+        .filter(|face| winding[face.index()] == Some(1));
+    let triangles: Vec<[usize; 3]> = inside
+        .map(|face| face.vertices().map(|v| corner_of[v.index()]))
+        .collect();
+    (!triangles.is_empty()).then_some(triangles)
+}
+
+/// The corners in the plane, the point of each, and for each point the first corner there. `None`
+/// if corners at different positions fall on one point, which is the case for a polygon that stands
+/// on its own plane.
+fn points(
+    flat: &[[f64; 2]],
+    local: &[[f64; 3]],
+) -> Option<(Plane, Vec<FixedVertexHandle>, Vec<usize>)> {
+    let n = flat.len();
+    let mut plane = Plane::with_capacity(n, 3 * n, 2 * n);
+    let mut ring: Vec<FixedVertexHandle> = Vec::with_capacity(n);
+    let mut corner_of: Vec<usize> = Vec::with_capacity(n);
+    for (corner, p) in flat.iter().enumerate() {
+        // Below this a coordinate has no digits left in predicates; the unit is the size of the
+        // polygon.
+        let [x, y] = p.map(|x| {
+            if x.abs() < spade::MIN_ALLOWED_VALUE {
+                0.0
+            } else {
+                x
+            }
+        });
+        let point = Point2::new(x, y);
+        let handle = match ring.last() {
+            Some(&near) => plane.insert_with_hint(point, near).ok()?,
+            None => plane.insert(point).ok()?,
+        };
+        match corner_of.get(handle.index()) {
+            Some(&first) if local[first] != local[corner] => return None,
+            Some(_) => {}
+            None => corner_of.push(corner),
+        }
+        ring.push(handle);
+    }
+    Some((plane, ring, corner_of))
+}
+
+/// How often the polygon passes along each pair of points; edges that other corners lie on are
+/// passed in pieces.
+type Passes = HashMap<(usize, usize), i32>;
+
+/// The plane with the polygon's edges in it, and how often each is passed; `None` if two of them
+/// cross, or if a corner that lies on an edge in the plane does not do so in space, where `place`
+/// says it is.
+fn edges(
+    mut plane: Plane,
+    ring: &[FixedVertexHandle],
+    place: impl Fn(usize) -> [f64; 3],
+) -> Option<(Plane, Passes)> {
+    let mut passes = Passes::with_capacity(ring.len());
+    for (i, &from) in ring.iter().enumerate() {
+        let to = ring[(i + 1) % ring.len()];
+        if from == to {
+            continue;
+        }
+        let pieces = plane.try_add_constraint(from, to);
+        if pieces.is_empty() {
+            return None;
+        }
+        let (begin, end) = (place(from.index()), place(to.index()));
+        let along = sub(end, begin);
+        for piece in pieces {
+            let edge = plane.directed_edge(piece);
+            let pair = (edge.from().index(), edge.to().index());
+            let aside = norm(cross(sub(place(pair.1), begin), along));
+            if aside > ASIDE * norm(along) {
+                return None;
+            }
+            *passes.entry(pair).or_default() += 1;
+        }
+    }
+    Some((plane, passes))
+}
+
+#[cfg(test)]
+mod tests;
