@@ -80,7 +80,8 @@ pub struct Http {
     pub allow_remote: bool,
     /// Whether the viewer may change labels.
     pub edit: bool,
-    /// File of the token that is asked for; empty: none on loopback, beyond it one in the folder of the library.
+    /// File of the token that is asked for; empty: none on loopback, beyond it one in the folder of
+    /// the library.
     pub token_file: PathBuf,
     /// Whether monitoring needs no token.
     pub open_monitoring: bool,

@@ -1,11 +1,11 @@
 //! The daemon: a shell around [`Library`] that takes requests over ZeroMQ and publishes events.
 //!
-//! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts what
-//! arrives into reads (side by side), changes (one after the other, in order of arrival) and waits;
-//! [`work`] describes and [`placing`] places accepted shapes, [`asked`] answers what needs computing, all three in
-//! processes of their own ([`worker`]); [`publish`] sends what the event log gained. What browsers and monitors
-//! ask has a runtime of its own ([`http`]).
-//! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
+//! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts
+//! what arrives into reads (side by side), changes (one after the other, in order of arrival) and
+//! waits; [`work`] describes and [`placing`] places accepted shapes, [`asked`] answers what needs
+//! computing, all three in processes of their own ([`worker`]); [`publish`] sends what the event
+//! log gained. What browsers and monitors ask has a runtime of its own ([`http`]). Every queue is
+//! bounded; beyond the bound a request is refused with a delay after which to retry.
 
 mod access;
 mod asked;
@@ -27,6 +27,7 @@ mod work;
 mod worker;
 mod writes;
 
+pub use http::TokenError;
 pub use service::{ServeError, serve};
 pub use worker::{POISON_VARIABLE, WORKER_COMMAND, run_worker};
 

@@ -1,4 +1,5 @@
-//! Requests that wait: for a job to change, for shapes to be placed, until nothing is left to do. They hold no thread.
+//! Requests that wait: for a job to change, for shapes to be placed, until nothing is left to do.
+//! They hold no thread.
 
 use crate::daemon::requests::{Answer, draining, panic_error, panicked};
 use crate::daemon::{Daemon, blocking, reads};
@@ -9,8 +10,8 @@ use std::time::Duration;
 
 /// Longest wait of WatchJob and WaitIdle, in milliseconds.
 pub(crate) const MAX_WAIT_MS: u64 = 30_000;
-/// WatchJob answers changes no faster than this, so that a client that asks again at once does not read
-/// a job from the catalog a thousand times a second.
+/// WatchJob answers changes no faster than this, so that a client that asks again at once does not
+/// read a job from the catalog a thousand times a second.
 const WATCH_PACE: Duration = Duration::from_millis(50);
 
 /// Reads a job and shows it.

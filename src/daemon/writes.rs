@@ -20,8 +20,9 @@ pub(crate) enum Done {
     WhenPlaced(u64),
 }
 
-/// The idempotency key of a request, if its client has a name. The name belongs to the key of its `owner`, if connections are
-/// authenticated: another one's client of the same name is another client.
+/// The idempotency key of a request, if its client has a name. The name belongs to the key of its
+/// `owner`, if connections are authenticated: another one's client of the same name is another
+/// client.
 pub(crate) fn key(request: &wire::Request, owner: Option<&str>) -> Option<RequestKey> {
     (!request.client_id.is_empty()).then(|| RequestKey {
         client_id: match owner {

@@ -35,8 +35,9 @@ pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
     Ok(())
 }
 
-/// Whether a character shows nothing of itself: names that differ by it look the same, or look like others. Joiners are part
-/// of scripts and of pictures; they hide between letters of ASCII and at the ends.
+/// Whether a character shows nothing of itself: names that differ by it look the same, or look like
+/// others. Joiners are part of scripts and of pictures; they hide between letters of ASCII and at
+/// the ends.
 fn is_hidden(chars: &[char], i: usize) -> bool {
     match chars[i] {
         '\u{200c}' | '\u{200d}' => {
@@ -75,8 +76,8 @@ fn is_blank(c: char) -> bool {
     )
 }
 
-/// Text with names in it for people: what cannot be seen is written as its number, and so are letters that look like Latin
-/// ones within a word that has Latin ones too.
+/// Text with names in it for people: what cannot be seen is written as its number, and so are
+/// letters that look like Latin ones within a word that has Latin ones too.
 pub fn shown(text: &str) -> Cow<'_, str> {
     if text.is_ascii() {
         return Cow::Borrowed(text);

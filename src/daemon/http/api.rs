@@ -158,7 +158,8 @@ async fn library(server: &Server) -> Answer {
     .await
 }
 
-/// A collection with all of its shapes, written a page at a time: as values they take many times their text.
+/// A collection with all of its shapes, written a page at a time: as values they take many times
+/// their text.
 async fn collection(server: &Server, name: String) -> Answer {
     let request = wire::DescribeCollectionRequest {
         collection: name.clone(),
@@ -290,7 +291,8 @@ struct Undo {
     collection: String,
 }
 
-/// Reads the body of a change, off the threads that wait. Its memory is given back when what was read is dropped.
+/// Reads the body of a change, off the threads that wait. Its memory is given back when what was
+/// read is dropped.
 async fn parsed<T: serde::de::DeserializeOwned + Send + 'static>(
     server: &Server,
     sent: Kept<Vec<u8>>,

@@ -1,7 +1,9 @@
-//! Connections: how many there are, which one makes way for a new one, and how long a peer may keep the daemon waiting.
+//! Connections: how many there are, which one makes way for a new one, and how long a peer may keep
+//! the daemon waiting.
 //!
-//! Who comes cannot be known before a request is read, so nothing can be set aside for monitoring. In its place a new
-//! connection always gets in: where all places are taken, the one goes that has kept the daemon waiting for longest.
+//! Who comes cannot be known before a request is read, so nothing can be set aside for monitoring.
+//! In its place a new connection always gets in: where all places are taken, the one goes that has
+//! kept the daemon waiting for longest.
 
 use super::Server;
 use hyper::server::conn::http1;
@@ -22,8 +24,8 @@ use tokio::time::Sleep;
 
 /// Connections at a time.
 const MAX_CONNECTIONS: usize = 128;
-/// For the head of a request, also the first and the next on a connection that is kept open; for its body; and for the
-/// next [`PACE`] bytes of an answer to be taken.
+/// For the head of a request, also the first and the next on a connection that is kept open; for
+/// its body; and for the next [`PACE`] bytes of an answer to be taken.
 pub(super) const PEER_TIME: Duration = Duration::from_secs(10);
 /// After which a connection ends whatever it is at.
 const CONNECTION_TIME: Duration = Duration::from_secs(900);
@@ -143,7 +145,8 @@ pub(super) async fn serve(server: Arc<Server>, listener: TcpListener) {
 }
 
 async fn attend(server: Arc<Server>, stream: TcpStream, connection: Arc<Connection>) {
-    // Answers are written whole; without it the last piece of each could wait for an acknowledgement.
+    // Answers are written whole; without it the last piece of each could wait for an
+    // acknowledgement.
     let _ = stream.set_nodelay(true);
     let service = service_fn(|request| async {
         connection.works();

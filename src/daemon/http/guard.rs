@@ -1,4 +1,5 @@
-//! Who may ask: hosts that are this machine, pages that are the viewer's own, and the token where one is asked for.
+//! Who may ask: hosts that are this machine, pages that are the viewer's own, and the token where
+//! one is asked for.
 
 use super::token::Token;
 use hyper::Uri;
@@ -70,7 +71,8 @@ impl Guard {
     }
 }
 
-/// Refuses what a page of another site asks a browser for: it could read nothing, but have much computed.
+/// Refuses what a page of another site asks a browser for: it could read nothing, but have much
+/// computed.
 pub(super) fn check_site(headers: &HeaderMap) -> Result<(), String> {
     let own = ["same-origin", "none"];
     match headers.get(FETCH_SITE).map(HeaderValue::to_str) {

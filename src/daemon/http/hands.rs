@@ -1,5 +1,5 @@
-//! What HTTP may take of the daemon: threads of its own, a few of lower priority for what takes time, memory, and so many
-//! requests at a time.
+//! What HTTP may take of the daemon: threads of its own, a few of lower priority for what takes
+//! time, memory, and so many requests at a time.
 
 use crate::config::Limits;
 use crate::daemon::memory::{Budget, Reservation};
@@ -19,8 +19,8 @@ const N_WORKING: usize = 2;
 const N_BLOCKING: usize = N_WORKING + 1;
 /// As much as describing and placing give way: a page waits rather than a client of the sockets.
 const NICENESS: i32 = 5;
-/// Requests of viewers in hand, and of those for which the daemon is asked at a time: both kinds together fewer than there
-/// are connections, so that some can always make way.
+/// Requests of viewers in hand, and of those for which the daemon is asked at a time: both kinds
+/// together fewer than there are connections, so that some can always make way.
 const READS: (usize, usize) = (48, 8);
 const CHANGES: (usize, usize) = (16, 4);
 

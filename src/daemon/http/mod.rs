@@ -1,7 +1,8 @@
 //! A small HTTP endpoint: health and metrics for monitoring, the viewer and its interface for browsers.
 //!
-//! Without a token it listens on loopback only; beyond it asks for one ([`guard`], [`token`]). It has a runtime, memory
-//! and places of its own ([`door`], [`hands`]): whatever a page asks for, the sockets and signals are served all the same.
+//! Without a token it listens on loopback only; beyond it asks for one ([`guard`], [`token`]). It
+//! has a runtime, memory and places of its own ([`door`], [`hands`]): whatever a page asks for, the
+//! sockets and signals are served all the same.
 
 mod api;
 mod door;
@@ -39,8 +40,8 @@ use tokio::sync::{mpsc, oneshot};
 
 /// Bytes of the body of a change: runs of labels.
 const MAX_BODY: u64 = 8 << 20;
-/// Bytes that are set aside for each byte of a body when it comes: for itself, in a buffer that doubles, and for the
-/// runs that it is read to.
+/// Bytes that are set aside for each byte of a body when it comes: for itself, in a buffer that
+/// doubles, and for the runs that it is read to.
 const PER_BODY_BYTE: u64 = 5;
 /// A request that takes longer has failed for the page.
 const ANSWER_MS: u64 = 60_000;
@@ -55,8 +56,8 @@ const CLIENT: Bytes = Bytes::from_static(b"\0http requests");
 
 static SCRIPT: LazyLock<Bytes> = LazyLock::new(|| page::script().into());
 static PAGE: LazyLock<Bytes> = LazyLock::new(|| page::live().into());
-/// What a token is turned into the cookie with. The page asks for itself once more: a browser shows such a cookie to no
-/// page that another site led to, but to one that this page led to.
+/// What a token is turned into the cookie with. The page asks for itself once more: a browser shows
+/// such a cookie to no page that another site led to, but to one that this page led to.
 const AGAIN: &str = "<!doctype html><meta charset=\"utf-8\"><meta http-equiv=\"refresh\" content=\"0;url=/\">\
                      <title>coseg</title><a href=\"/\">The viewer</a>";
 
@@ -89,8 +90,8 @@ pub(crate) struct Bound {
     guard: Guard,
 }
 
-/// Binds the address that is configured, if one is. The token, if one is needed and there is none, is made in the folder
-/// of the library, which must be there.
+/// Binds the address that is configured, if one is. The token, if one is needed and there is none,
+/// is made in the folder of the library, which must be there.
 pub(crate) fn bind(config: &Config, library: &Path) -> Result<Option<Bound>, StartError> {
     let Some(address) = config.http.address()? else {
         return Ok(None);
@@ -201,7 +202,8 @@ impl Server {
         let monitoring = ["/healthz", "/readyz", "/metrics"];
         let monitoring = monitoring.into_iter().find(|m| *m == path);
         let host = self.guard.check_host(request.uri(), request.headers());
-        // Whether the daemon lives and is ready is no secret, and a probe may call it what it likes.
+        // Whether the daemon lives and is ready is no secret, and a probe may call it what it
+        // likes.
         let is_probe = ["/healthz", "/readyz"].contains(&path.as_str());
         if let Err(why) = &host
             && !is_probe
@@ -410,8 +412,8 @@ impl Server {
             })
     }
 
-    /// Asks what a client of the sockets could ask, on the same way: the same order, limits and counters. The memory of
-    /// frames goes with them.
+    /// Asks what a client of the sockets could ask, on the same way: the same order, limits and
+    /// counters. The memory of frames goes with them.
     async fn ask(&self, body: Body, frames: Option<hands::Kept<Vec<Bytes>>>) -> Answer {
         let (frames, memory) = frames.map_or((Vec::new(), None), |f| (f.it, Some(f.memory)));
         let n_bytes: u64 = frames.iter().map(|f| f.len() as u64).sum();

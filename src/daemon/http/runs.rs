@@ -3,8 +3,9 @@
 /// Labels as runs of polygons: first, count, label.
 pub(super) type Run = (usize, usize, i32);
 
-/// A label for each of a shape's polygons; -1 where no run says one, and where several do, the last. Nothing is laid out
-/// before the runs are known to fit, so that it takes no longer than the shape is large.
+/// A label for each of a shape's polygons; -1 where no run says one, and where several do, the
+/// last. Nothing is laid out before the runs are known to fit, so that it takes no longer than the
+/// shape is large.
 pub(super) fn labels_of(n_polygons: usize, runs: &[Run]) -> Result<Vec<i32>, String> {
     let mut total = 0_usize;
     for &(first, count, _) in runs {

@@ -33,7 +33,8 @@ pub enum TokenError {
     Form { path: String, found: usize },
 }
 
-/// A token, as what is compared with what is shown: a digest, whose comparison takes the same time whatever differs.
+/// A token, as what is compared with what is shown: a digest, whose comparison takes the same time
+/// whatever differs.
 pub(super) struct Token(blake3::Hash);
 
 impl Token {

@@ -1,5 +1,5 @@
-//! What a request says is checked before anything is done for it: values that this version does not know, frames that no
-//! field names, lists beyond their limits.
+//! What a request says is checked before anything is done for it: values that this version does not
+//! know, frames that no field names, lists beyond their limits.
 
 use super::errors::{error, field_error};
 use crate::ipc::wire::{
@@ -112,7 +112,8 @@ fn check_points(points: Option<&wire::PointMapOptions>) -> Result<(), wire::Erro
     at_most("points.landmarks", points.landmarks.len(), MAX_LANDMARKS)
 }
 
-/// Frames that fields name. What is named and was not sent is refused where it is read, with the field.
+/// Frames that fields name. What is named and was not sent is refused where it is read, with the
+/// field.
 #[derive(Default)]
 struct Named(Vec<u32>);
 
