@@ -198,7 +198,9 @@ pub(crate) struct Serve {
     /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
     #[arg(long, value_name = "DIR")]
     pub(crate) keys: Option<PathBuf>,
-    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as 127.0.0.1:8640
+    /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as
+    /// 127.0.0.1:8640; keys do not cover it, and beyond loopback (http.allow_remote) it asks for a
+    /// token
     #[arg(long, value_name = "HOST:PORT")]
     pub(crate) http: Option<String>,
     /// Threads that describe shapes; 0: one for each processor

@@ -80,6 +80,11 @@ pub struct Http {
     pub allow_remote: bool,
     /// Whether the viewer may change labels.
     pub edit: bool,
+    /// File of the token that is asked for; empty: none on loopback, beyond it one in the folder of
+    /// the library.
+    pub token_file: PathBuf,
+    /// Whether monitoring needs no token.
+    pub open_monitoring: bool,
 }
 
 impl Http {
@@ -101,8 +106,8 @@ impl Http {
             .map_err(|_| refuse(format!("{:?} is not IP-ADDRESS:PORT", self.listen)))?;
         if !address.ip().is_loopback() && !self.allow_remote {
             return Err(refuse(format!(
-                "{address} is not loopback; the endpoint has no authentication, so set http.allow_remote if \
-                 other machines are to reach it"
+                "{address} is not loopback; set http.allow_remote if other machines are to reach it: it asks for \
+                 a token, but does not encrypt"
             )));
         }
         Ok(Some(address))
@@ -381,6 +386,11 @@ impl Limits {
     /// Bytes set aside for shapes being described.
     pub fn describe_bytes(&self) -> u64 {
         self.memory.0 / 2
+    }
+
+    /// Bytes set aside for what HTTP has in hand: a share, and the largest answer at least.
+    pub fn http_bytes(&self) -> u64 {
+        self.max_message.0.max(self.memory.0 / 8)
     }
 
     /// Bytes of one shape's file: as set, and so that it can be described at all.

@@ -5,6 +5,7 @@ use super::{CommandError, Outcome};
 use crate::cli::{Jobs, Retry};
 use coseg::call;
 use coseg::ipc::wire::{self, ItemState};
+use coseg::library::shown;
 use serde_json::{Value, json};
 
 pub(crate) fn jobs(args: &Jobs, mut session: Session) -> Outcome {
@@ -94,7 +95,7 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
         session.print_json(&json!({ "n_queued": reply.n_queued, "job": to_json(&job) }))?;
     } else {
         for item in &failed {
-            eprintln!("{}: {}", item.name, why(item));
+            eprintln!("{}: {}", shown(&item.name), why(item));
         }
         eprintln!("{} shapes were queued again", reply.n_queued);
     }

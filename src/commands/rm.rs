@@ -6,6 +6,7 @@ use crate::cli::Rm;
 use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::wire;
+use coseg::library::shown;
 use serde_json::json;
 
 pub(crate) fn run(args: &Rm, mut session: Session) -> Outcome {
@@ -19,7 +20,7 @@ pub(crate) fn run(args: &Rm, mut session: Session) -> Outcome {
         match call!(session.client, RemoveShape(request)) {
             Ok(_) => removed.push(shape.clone()),
             Err(ClientError::Refused(e)) => {
-                eprintln!("coseg: {shape}: {}", e.message);
+                eprintln!("coseg: {}: {}", shown(shape), e.message);
                 failed.push(json!({ "name": shape, "error": json::error(&e) }));
             }
             Err(e) => return Err(CommandError::Client(e)),

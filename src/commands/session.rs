@@ -7,6 +7,7 @@ use coseg::ipc::client::Client;
 use coseg::ipc::endpoint::Endpoint;
 use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
 use coseg::ipc::wire;
+use coseg::library::shown;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::Value;
 use std::io::{IsTerminal as _, Write as _};
@@ -175,9 +176,9 @@ impl Session {
         }
     }
 
-    /// Prints a line of data.
+    /// Prints a line of data for people.
     pub(crate) fn line(&self, text: &str) -> Result<(), CommandError> {
-        print_line(text)
+        print_line(&shown(text))
     }
 
     /// Prints JSON, the only thing on stdout.
@@ -197,6 +198,7 @@ pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
 /// Several collections could be meant.
 pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     let names = names.join(", ");
+    let names = shown(&names);
     CommandError::Usage(format!(
         "there are several collections, choose one with --collection: {names}"
     ))
@@ -204,6 +206,8 @@ pub(crate) fn ambiguous(names: &[String]) -> CommandError {
 
 /// Columns padded to the widest entry; the first row is the heading.
 pub(crate) fn table(rows: &[Vec<String>]) -> String {
+    let shown_row = |row: &Vec<String>| row.iter().map(|c| shown(c).into_owned()).collect();
+    let rows: Vec<Vec<String>> = rows.iter().map(shown_row).collect();
     let n = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |i: usize| {
         rows.iter()

@@ -12,6 +12,7 @@ use crate::ipc::wire::{self, ErrorCode, ErrorReason, request::Body};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use tokio::sync::watch;
 
 /// Where ZeroMQ asks about connections.
 pub(crate) const ZAP_ENDPOINT: &str = "inproc://zeromq.zap.01";
@@ -31,7 +32,9 @@ pub(crate) enum Access {
 pub(crate) struct Keys {
     server: KeyPair,
     path: PathBuf,
-    list: Mutex<(Stamp, Arc<AllowList>)>,
+    /// Of the list as it was last read.
+    stamp: Mutex<Stamp>,
+    list: watch::Sender<Arc<AllowList>>,
 }
 
 impl Access {
@@ -45,7 +48,8 @@ impl Access {
         let list = Arc::new(AllowList::read(&path)?);
         Ok(Self::Keys(Keys {
             server: KeyPair::read(&keys.join(SERVER_KEY_FILE))?,
-            list: Mutex::new((stamp(&path), list)),
+            stamp: Mutex::new(stamp(&path)),
+            list: watch::Sender::new(list),
             path,
         }))
     }
@@ -55,30 +59,30 @@ impl Access {
     pub(crate) fn reload(&self, always: bool) -> bool {
         let Self::Keys(keys) = self else { return false };
         let found = stamp(&keys.path);
-        let mut list = keys.list.lock().unwrap_or_else(PoisonError::into_inner);
-        if list.0 == found && !always {
+        let mut read = keys.stamp.lock().unwrap_or_else(PoisonError::into_inner);
+        if *read == found && !always {
             return false;
         }
+        *read = found;
         match AllowList::read(&keys.path) {
             Ok(new) => {
-                let gone = list
-                    .1
+                let old = keys.list();
+                let gone = old
                     .clients()
                     .iter()
                     .any(|old| new.find(old.key.as_str()).is_none());
-                if *list.1 != new {
+                if *old != new {
                     tracing::info!(
                         clients = new.clients().len(),
                         "the allow list was read again"
                     );
                 }
-                *list = (found, Arc::new(new));
+                keys.list.send_replace(Arc::new(new));
                 gone
             }
             Err(e) => {
                 // Told once for each change of the file.
                 tracing::error!(error = %e, "the allow list stays as it was");
-                list.0 = found;
                 false
             }
         }
@@ -123,11 +127,7 @@ impl Access {
             Self::Keys(keys) => {
                 let list = keys.list();
                 let Some(client) = user.and_then(|key| list.find(key)) else {
-                    return Err(convert::error(
-                        ErrorCode::PermissionDenied,
-                        ErrorReason::KeyNotAllowed,
-                        "the client's key is not, or no longer, on the allow list",
-                    ));
+                    return Err(not_allowed(""));
                 };
                 (client.role, client.name.clone())
             }
@@ -143,6 +143,14 @@ impl Access {
         ))
     }
 
+    /// The list as it stands, for those who wait to see that they are taken off it.
+    pub(crate) fn allowed(&self) -> Option<watch::Receiver<Arc<AllowList>>> {
+        match self {
+            Self::Open(_) => None,
+            Self::Keys(keys) => Some(keys.list.subscribe()),
+        }
+    }
+
     /// Whether every connection is authenticated.
     pub(crate) fn has_keys(&self) -> bool {
         matches!(self, Self::Keys(_))
@@ -151,8 +159,18 @@ impl Access {
 
 impl Keys {
     fn list(&self) -> Arc<AllowList> {
-        Arc::clone(&self.list.lock().unwrap_or_else(PoisonError::into_inner).1)
+        Arc::clone(&self.list.borrow())
     }
+}
+
+/// Who asks is not on the list; `rest` tells what becomes of the request.
+pub(crate) fn not_allowed(rest: &str) -> wire::Error {
+    let text = format!("the client's key is not, or no longer, on the allow list{rest}");
+    convert::error(
+        ErrorCode::PermissionDenied,
+        ErrorReason::KeyNotAllowed,
+        text,
+    )
 }
 
 /// The least role that may make a request.

@@ -48,9 +48,10 @@ impl Budget {
     }
 
     /// Waits until there is room. More than the limit is handed out when nothing else is, so that a limit
-    /// that was lowered cannot block for ever. Only one task may wait.
+    /// that was lowered cannot block for ever.
     pub(crate) async fn reserve(self: &Arc<Self>, bytes: u64) -> Reservation {
         loop {
+            // Made before looking: what is freed from here on is not missed.
             let freed = self.freed.notified();
             let limit = self.state().limit;
             if let Some(reservation) = self.try_reserve(bytes.min(limit)) {
@@ -62,7 +63,7 @@ impl Budget {
 
     pub(crate) fn set_limit(&self, limit: u64) {
         self.state().limit = limit;
-        self.freed.notify_one();
+        self.freed.notify_waiters();
     }
 
     pub(crate) fn limit(&self) -> u64 {
@@ -75,12 +76,22 @@ impl Budget {
 }
 
 impl Reservation {
+    /// Takes so many bytes more, or leaves it as it is.
+    #[must_use]
+    pub(crate) fn try_grow(&mut self, bytes: u64) -> bool {
+        let Some(mut more) = self.budget.try_reserve(bytes) else {
+            return false;
+        };
+        self.bytes += std::mem::take(&mut more.bytes);
+        true
+    }
+
     /// Gives back all but `bytes`.
     pub(crate) fn shrink_to(&mut self, bytes: u64) {
         let excess = self.bytes.saturating_sub(bytes);
         self.bytes -= excess;
         self.budget.state().used -= excess;
-        self.budget.freed.notify_one();
+        self.budget.freed.notify_waiters();
     }
 }
 
@@ -103,6 +114,8 @@ mod tests {
         let b = budget.try_reserve(40).unwrap();
         a.shrink_to(10);
         assert_eq!(budget.used(), 50);
+        assert!(a.try_grow(50) && !a.try_grow(1));
+        assert_eq!(budget.used(), 100);
         drop((a, b));
         assert_eq!(budget.used(), 0);
     }
@@ -115,14 +128,15 @@ mod tests {
         runtime.block_on(async {
             let budget = Budget::new(100);
             let held = budget.reserve(100).await;
-            let waiting = tokio::spawn({
+            let wait = || {
                 let budget = std::sync::Arc::clone(&budget);
-                async move { budget.reserve(1_000).await.bytes }
-            });
+                tokio::spawn(async move { budget.reserve(1_000).await.bytes })
+            };
+            let (one, other) = (wait(), wait());
             tokio::task::yield_now().await;
-            assert!(!waiting.is_finished());
+            assert!(!one.is_finished() && !other.is_finished());
             drop(held);
-            assert_eq!(waiting.await.unwrap(), 100);
+            assert_eq!((one.await.unwrap(), other.await.unwrap()), (100, 100));
         });
     }
 }

@@ -1,10 +1,11 @@
 //! The daemon: a shell around [`Library`] that takes requests over ZeroMQ and publishes events.
 //!
-//! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts what
-//! arrives into reads (side by side), changes (one after the other, in order of arrival) and waits;
-//! [`work`] describes and [`placing`] places accepted shapes, [`asked`] answers what needs computing, all three in
-//! processes of their own ([`worker`]); [`publish`] sends what the event log gained.
-//! Every queue is bounded; beyond the bound a request is refused with a delay after which to retry.
+//! One thread owns the sockets ([`sockets`]), a tokio runtime does the rest: [`requests`] sorts
+//! what arrives into reads (side by side), changes (one after the other, in order of arrival) and
+//! waits; [`work`] describes and [`placing`] places accepted shapes, [`asked`] answers what needs
+//! computing, all three in processes of their own ([`worker`]); [`publish`] sends what the event
+//! log gained. What browsers and monitors ask has a runtime of its own ([`http`]). Every queue is
+//! bounded; beyond the bound a request is refused with a delay after which to retry.
 
 mod access;
 mod asked;
@@ -21,17 +22,19 @@ mod reads;
 mod requests;
 mod service;
 mod sockets;
+mod waits;
 mod work;
 mod worker;
 mod writes;
 
+pub use http::TokenError;
 pub use service::{ServeError, serve};
 pub use worker::{POISON_VARIABLE, WORKER_COMMAND, run_worker};
 
 use crate::Library;
 use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
-use crate::ipc::keys::KeyError;
+use crate::ipc::keys::{AllowList, KeyError};
 use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
@@ -81,6 +84,8 @@ pub enum StartError {
         address: std::net::SocketAddr,
         source: std::io::Error,
     },
+    #[error(transparent)]
+    Token(#[from] http::TokenError),
     #[error("threads cannot be started: {0}")]
     Threads(#[from] std::io::Error),
 }
@@ -89,7 +94,7 @@ impl StartError {
     /// Whether the configuration or the command line must be changed.
     pub fn is_configuration(&self) -> bool {
         match self {
-            Self::Config(_) | Self::Keys(_) | Self::NoCurve => true,
+            Self::Config(_) | Self::Keys(_) | Self::NoCurve | Self::Token(_) => true,
             Self::Endpoint(e) => {
                 !matches!(e, EndpointError::InUse { .. } | EndpointError::Io { .. })
             }
@@ -126,8 +131,8 @@ struct Daemon {
     http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
     quotas: Arc<Quotas>,
-    /// Whether connections are authenticated.
-    has_keys: bool,
+    /// Who may connect, as it stands, if connections are authenticated.
+    allowed: Option<watch::Receiver<Arc<AllowList>>>,
     describe_memory: Arc<Budget>,
     /// A permit for each thread that may describe.
     workers: Arc<Semaphore>,
@@ -150,6 +155,11 @@ struct Daemon {
 impl Daemon {
     fn config(&self) -> Arc<Config> {
         Arc::clone(&self.config.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Whether connections are authenticated.
+    fn has_keys(&self) -> bool {
+        self.allowed.is_some()
     }
 
     fn is_draining(&self) -> bool {
@@ -187,6 +197,8 @@ fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
 pub struct Running {
     daemon: Arc<Daemon>,
     runtime: Option<tokio::runtime::Runtime>,
+    /// That of HTTP.
+    pages: Option<tokio::runtime::Runtime>,
     sockets: Option<std::thread::JoinHandle<()>>,
     publisher: Option<tokio::task::JoinHandle<()>>,
     socket_tick: Arc<AtomicU64>,
@@ -205,15 +217,15 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         return Err(StartError::NoCurve);
     }
     let access = access::Access::new(&config.security.keys)?;
+    let allowed = access.allowed();
     let bound = sockets::bind(&endpoint, &config.limits, access)?;
-    let address = config.http.address()?;
-    let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
     let opened = |source| StartError::Library {
         path: directory.display().to_string(),
         source,
     };
     let library = Library::open(&directory).map_err(opened)?;
+    let pages = http::bind(&config, &directory)?;
     let mut queued = Vec::new();
     for item in library.queued_items().map_err(opened)? {
         let n_bytes = library.item_bytes(&item).map_err(opened)?;
@@ -238,10 +250,10 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         started: Instant::now(),
         counters: Arc::default(),
         metrics: Arc::new(Metrics::new()),
-        http: listener.as_ref().and_then(|l| l.local_addr().ok()),
+        http: pages.as_ref().and_then(http::Bound::address),
         request_memory: Budget::new(config.limits.request_bytes()),
         quotas: Quotas::new(&config.limits),
-        has_keys: config.has_keys(),
+        allowed,
         describe_memory: Budget::new(config.limits.describe_bytes()),
         workers: Arc::new(Semaphore::new(n_workers)),
         n_workers,
@@ -280,13 +292,12 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
     tokio::spawn(sweep(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
-    if let Some(listener) = listener {
-        let listener = tokio::net::TcpListener::from_std(listener)?;
-        let server = http::Server::new(Arc::clone(&daemon), requests_in.clone());
-        tokio::spawn(server.watch(Arc::clone(&socket_tick)));
-        tokio::spawn(http::serve(server, listener));
-    }
     drop(guard);
+    let serve = |pages: http::Bound| {
+        let ticks = [&socket_tick, &runtime_tick];
+        pages.serve(Arc::clone(&daemon), requests_in.clone(), ticks)
+    };
+    let pages = pages.map(serve).transpose()?;
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
         quotas: Arc::clone(&daemon.quotas),
@@ -299,6 +310,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     Ok(Running {
         daemon,
         runtime: Some(runtime),
+        pages,
         sockets: Some(sockets),
         publisher: Some(publisher),
         socket_tick,
@@ -461,6 +473,9 @@ impl Running {
         if let Some(sockets) = self.sockets.take() {
             let _ = sockets.join();
         }
+        if let Some(pages) = self.pages.take() {
+            pages.shutdown_timeout(LAST_ANSWERS);
+        }
         runtime.shutdown_timeout(
             deadline
                 .saturating_duration_since(Instant::now())
@@ -471,6 +486,9 @@ impl Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
+        if let Some(pages) = self.pages.take() {
+            pages.shutdown_background();
+        }
         if let Some(runtime) = self.runtime.take() {
             self.daemon.outbox.stop();
             runtime.shutdown_background();

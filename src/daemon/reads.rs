@@ -1,10 +1,10 @@
 //! Requests that change nothing, answered from what is stored: rows are read, arrays are copied, nothing is computed from
 //! shapes.
 
+use crate::daemon::Daemon;
 use crate::daemon::metrics::Now;
-use crate::daemon::requests::MAX_WAIT_MS;
 use crate::daemon::sockets::{MAX_FRAMES, MAX_HEADER_BYTES, MAX_ID_CHARS};
-use crate::daemon::{Daemon, requests};
+use crate::daemon::waits::MAX_WAIT_MS;
 use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply, request::Body};
 use crate::ipc::{PROTOCOL, convert};
@@ -243,7 +243,7 @@ pub(crate) fn hello(daemon: &Daemon) -> wire::HelloReply {
             max_shape_bytes: limits.shape_bytes(),
             max_queued_shapes: limits.max_queued_shapes as u64,
             max_page: MAX_PAGE,
-            max_wait_ms: requests::MAX_WAIT_MS.min(MAX_WAIT_MS),
+            max_wait_ms: MAX_WAIT_MS,
             max_id_chars: MAX_ID_CHARS as u32,
         }),
         formats: Format::ALL.map(|f| convert::mesh_format(f).into()).to_vec(),

@@ -6,25 +6,21 @@ use crate::daemon::fair::{Gate, Pass, Turn};
 use crate::daemon::intake::{self, Intake, Room};
 use crate::daemon::service::Control;
 use crate::daemon::sockets::{BUSY_RETRY_MS, Incoming, ReplyTo};
-use crate::daemon::writes;
-use crate::daemon::{Daemon, asked, blocking, reads};
+use crate::daemon::waits::{wait_idle, wait_placed, watch_job};
+use crate::daemon::{Daemon, access, asked, blocking, reads, writes};
 use crate::ipc::convert;
+use crate::ipc::keys::AllowList;
 use crate::ipc::wire::{
     self, AddShapesRequest, ErrorCode, ErrorReason, Reply, error::Subject, reply, request::Body,
 };
-use crate::library::Job;
+use crate::library::{Job, RequestKey};
 use bytes::Bytes;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, watch};
 
-/// Longest wait of WatchJob and WaitIdle, in milliseconds.
-pub(crate) const MAX_WAIT_MS: u64 = 30_000;
-/// WatchJob answers changes no faster than this, so that a client that asks again at once does not read
-/// a job from the catalog a thousand times a second.
-const WATCH_PACE: Duration = Duration::from_millis(50);
 /// Collections whose gates are kept before idle ones are forgotten.
 const MAX_GATES: usize = 1_024;
 /// Reads that run at a time beyond the workers; they mostly wait for the disk.
@@ -39,6 +35,8 @@ pub(crate) type Answer = Result<(reply::Result, Vec<Bytes>), wire::Error>;
 pub(crate) struct InHand {
     pub(crate) incoming: Incoming,
     permit: OwnedSemaphorePermit,
+    /// Who may connect, as it stands.
+    allowed: Option<watch::Receiver<Arc<AllowList>>>,
 }
 
 /// Sorts requests until the socket thread ends.
@@ -65,7 +63,15 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
             continue;
         };
-        let mut in_hand = InHand { incoming, permit };
+        if let Err(error) = convert::check_request(&body, incoming.frames.len()) {
+            daemon.answer(incoming.reply_to, incoming.request.request_id, Err(error));
+            continue;
+        }
+        let mut in_hand = InHand {
+            incoming,
+            permit,
+            allowed: daemon.allowed.clone(),
+        };
         let client = in_hand.incoming.ticket.client().clone();
         let daemon = Arc::clone(&daemon);
         // Changes of labels may wait while a lane learns; nothing else waits with them.
@@ -157,8 +163,16 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     }
 }
 
-/// How far a request was when its deadline passed.
-enum Late {
+/// Why nobody waits for a request any more.
+enum Cut {
+    /// Its deadline passed.
+    Late,
+    /// The key of whoever asked was taken off the list.
+    Revoked,
+}
+
+/// How far a request was then.
+enum Reached {
     /// It changes nothing.
     Over,
     /// It was to change something, and will not.
@@ -192,10 +206,11 @@ async fn add_in_turn(
     mut in_hand: InHand,
     (keeping, turn): (Turn, Turn),
 ) {
-    let Some(pass) = in_hand.by_deadline(keeping.come()).await else {
-        return in_hand.late(&daemon, Late::NotBegun);
+    let pass = match in_hand.turn(keeping.come()).await {
+        Ok(pass) => pass,
+        Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
     };
-    let key = writes::key(&in_hand.incoming.request);
+    let key = in_hand.key();
     let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the files are there.
     let memory = in_hand.incoming.memory.take();
@@ -203,16 +218,18 @@ async fn add_in_turn(
         let _here = (memory, pass);
         intake::keep(d, request, &frames, room, key)
     });
-    let Some(kept) = in_hand.by_deadline(kept).await else {
-        return in_hand.late(&daemon, Late::NotBegun);
+    let kept = match in_hand.until_cut(kept).await {
+        Ok(kept) => kept,
+        Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
     };
     in_hand.incoming.ticket.free_bytes();
     let addition = match kept.unwrap_or_else(|panic| Err(panic_error(&panic))) {
         Ok(addition) => addition,
         Err(error) => return in_hand.finish(&daemon, Err(error)),
     };
-    let Some(pass) = in_hand.turn(turn.come()).await else {
-        return in_hand.late(&daemon, Late::NotBegun);
+    let pass = match in_hand.turn(turn.come()).await {
+        Ok(pass) => pass,
+        Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
     };
     let accepted = intake.accept(addition);
     drop(pass);
@@ -231,10 +248,11 @@ async fn change_in_turn(
     mut in_hand: InHand,
     turn: impl Future<Output = Pass>,
 ) {
-    let Some(pass) = in_hand.turn(turn).await else {
-        return in_hand.late(&daemon, Late::NotBegun);
+    let pass = match in_hand.turn(turn).await {
+        Ok(pass) => pass,
+        Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
     };
-    let key = writes::key(&in_hand.incoming.request);
+    let key = in_hand.key();
     let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the change is made: who waits for the placing holds no frames.
     let memory = in_hand.incoming.memory.take();
@@ -268,15 +286,20 @@ impl InHand {
         drop(self.permit);
     }
 
-    /// Answers with what `work` returns, or that the deadline passed.
+    /// The idempotency key.
+    fn key(&self) -> Option<RequestKey> {
+        writes::key(&self.incoming.request, self.incoming.user.as_deref())
+    }
+
+    /// Answers with what `work` returns, or why nobody waits for it any more.
     async fn respond<F: Future<Output = Answer>>(
         self,
         daemon: Arc<Daemon>,
         work: impl FnOnce(Arc<Daemon>) -> F,
     ) {
-        match self.by_deadline(work(Arc::clone(&daemon))).await {
-            Some(answer) => self.finish(&daemon, answer),
-            None => self.late(&daemon, Late::Over),
+        match self.until_cut(work(Arc::clone(&daemon))).await {
+            Ok(answer) => self.finish(&daemon, answer),
+            Err(why) => self.cut(&daemon, why, Reached::Over),
         }
     }
 
@@ -286,8 +309,9 @@ impl InHand {
         daemon: Arc<Daemon>,
         done: impl Future<Output = Result<writes::Done, wire::Error>>,
     ) {
-        let Some(done) = self.by_deadline(done).await else {
-            return self.late(&daemon, Late::GoesOn);
+        let done = match self.until_cut(done).await {
+            Ok(done) => done,
+            Err(why) => return self.cut(&daemon, why, Reached::GoesOn),
         };
         self.incoming.ticket.free_bytes();
         match done {
@@ -301,19 +325,25 @@ impl InHand {
                 }
             }
             Ok(writes::Done::WhenPlaced(job)) => {
-                match self.by_deadline(wait_placed(&daemon, job)).await {
-                    Some(answer) => self.finish(&daemon, answer),
-                    None => self.late(&daemon, Late::Accepted(job)),
+                match self.until_cut(wait_placed(&daemon, job)).await {
+                    Ok(answer) => self.finish(&daemon, answer),
+                    Err(why) => self.cut(&daemon, why, Reached::Accepted(job)),
                 }
             }
             Err(error) => self.finish(&daemon, Err(error)),
         }
     }
 
-    /// The turn of a request, unless its deadline passes before.
-    async fn turn(&self, turn: impl Future<Output = Pass>) -> Option<Pass> {
-        let pass = self.by_deadline(turn).await?;
-        (!self.is_late()).then_some(pass)
+    /// The turn of a request, unless nobody waits for it any more.
+    async fn turn(&self, turn: impl Future<Output = Pass>) -> Result<Pass, Cut> {
+        let pass = self.until_cut(turn).await?;
+        if self.is_late() {
+            return Err(Cut::Late);
+        }
+        if self.is_revoked() {
+            return Err(Cut::Revoked);
+        }
+        Ok(pass)
     }
 
     fn deadline(&self) -> Option<Instant> {
@@ -331,33 +361,64 @@ impl InHand {
         self.deadline().is_some_and(|d| d <= Instant::now())
     }
 
-    async fn by_deadline<T>(&self, work: impl Future<Output = T>) -> Option<T> {
-        match self.deadline() {
-            Some(deadline) => tokio::time::timeout_at(deadline.into(), work).await.ok(),
-            None => Some(work.await),
+    fn is_revoked(&self) -> bool {
+        let (Some(list), Some(key)) = (&self.allowed, &self.incoming.user) else {
+            return false;
+        };
+        list.borrow().find(key).is_none()
+    }
+
+    /// Comes when the key of whoever asked is taken off the list.
+    async fn revoked(&self) {
+        let (Some(list), Some(key)) = (&self.allowed, &self.incoming.user) else {
+            return std::future::pending().await;
+        };
+        let gone = |list: &Arc<AllowList>| list.find(key).is_none();
+        if list.clone().wait_for(gone).await.is_err() {
+            // The list went with the sockets: nobody is answered any more.
+            std::future::pending().await
         }
     }
 
-    fn late(self, daemon: &Daemon, how_far: Late) {
+    async fn until_cut<T>(&self, work: impl Future<Output = T>) -> Result<T, Cut> {
+        let late = async {
+            match self.deadline() {
+                Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            done = work => Ok(done),
+            () = late => Err(Cut::Late),
+            () = self.revoked() => Err(Cut::Revoked),
+        }
+    }
+
+    /// Answers a request for which nobody waits any more.
+    fn cut(self, daemon: &Daemon, why: Cut, how_far: Reached) {
         let ms = self.incoming.request.deadline_ms;
-        let has_key = writes::key(&self.incoming.request).is_some();
+        let has_key = self.key().is_some();
         let rest = match how_far {
-            Late::Over => String::new(),
-            Late::NotBegun => "; it was not begun".to_owned(),
-            Late::Accepted(job) => format!("; job {job} goes on"),
-            Late::GoesOn if has_key => {
+            Reached::Over => String::new(),
+            Reached::NotBegun => "; it was not begun".to_owned(),
+            Reached::Accepted(job) => format!("; job {job} goes on"),
+            Reached::GoesOn if has_key => {
                 "; the change goes on, and the same request, sent again with \
                 its request_id, tells what came of it"
                     .to_owned()
             }
-            Late::GoesOn => "; the change goes on".to_owned(),
+            Reached::GoesOn => "; the change goes on".to_owned(),
         };
-        let mut error = convert::error(
-            ErrorCode::DeadlineExceeded,
-            ErrorReason::Deadline,
-            format!("no answer within the request's {ms} ms{rest}"),
-        );
-        if let Late::Accepted(job) = how_far {
+        let mut error = match why {
+            Cut::Late => convert::error(
+                ErrorCode::DeadlineExceeded,
+                ErrorReason::Deadline,
+                format!("no answer within the request's {ms} ms{rest}"),
+            ),
+            Cut::Revoked => access::not_allowed(&rest),
+        };
+        if let Reached::Accepted(job) = how_far {
             error.subject = Some(Subject::JobId(job));
         }
         self.finish(daemon, Err(error));
@@ -449,133 +510,4 @@ pub(crate) fn draining() -> wire::Error {
         ErrorReason::Draining,
         "the daemon is shutting down; what it accepted is resumed at its next start",
     )
-}
-
-/// Reads a job and shows it.
-async fn read_job(daemon: &Arc<Daemon>, job: u64) -> Result<wire::Job, wire::Error> {
-    let read = blocking(daemon, move |d| {
-        d.library.job(job).map(|j| d.job_to_wire(&j))
-    })
-    .await;
-    match read {
-        Ok(Ok(job)) => Ok(job),
-        Ok(Err(e)) => Err(convert::library_error(&e)),
-        Err(panic) => Err(panic_error(&panic)),
-    }
-}
-
-/// The answer to AddShapes with ADD_MODE_WAIT.
-async fn wait_placed(daemon: &Arc<Daemon>, job: u64) -> Answer {
-    let mut changes = daemon.work.changes();
-    let mut drain = daemon.drain.subscribe();
-    while daemon.work.progress().revision(job).is_some() {
-        tokio::select! {
-            _ = changes.changed() => {}
-            _ = drain.wait_for(|&d| d) => break,
-        }
-    }
-    let job = read_job(daemon, job).await?;
-    if !job.finished {
-        return Err(convert::with_subject(
-            draining(),
-            Subject::JobId(job.job_id),
-        ));
-    }
-    let reply = convert::add_shapes(job.job_id, job.items.len(), Some(job));
-    Ok((reply::Result::AddShapes(reply), Vec::new()))
-}
-
-fn wait_limit(ms: u64) -> Result<Duration, wire::Error> {
-    if ms <= MAX_WAIT_MS {
-        return Ok(Duration::from_millis(ms));
-    }
-    let text = format!("wait_ms is {ms}, the limit is {MAX_WAIT_MS}");
-    Err(convert::field_error(
-        ErrorReason::FieldRange,
-        "wait_ms",
-        text,
-    ))
-}
-
-async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Answer {
-    let begin = tokio::time::Instant::now();
-    let until = begin + wait_limit(request.wait_ms)?;
-    let mut changes = daemon.work.changes();
-    let mut drain = daemon.drain.subscribe();
-    loop {
-        let revision = daemon.work.progress().revision(request.job_id);
-        let revision = match revision {
-            Some(revision) => revision,
-            // Over, or a correction that is carried, which only the catalog knows.
-            None => match read_job(daemon, request.job_id).await? {
-                job if job.finished => break,
-                job => job.revision,
-            },
-        };
-        if revision != request.revision && begin.elapsed() >= WATCH_PACE {
-            break;
-        }
-        let pace = begin + WATCH_PACE;
-        let wake = if revision == request.revision {
-            until
-        } else {
-            pace.min(until)
-        };
-        tokio::select! {
-            _ = changes.changed() => {}
-            () = tokio::time::sleep_until(wake) => {
-                if wake == until {
-                    break;
-                }
-            }
-            _ = drain.wait_for(|&d| d) => break,
-        }
-    }
-    let job = read_job(daemon, request.job_id).await?;
-    Ok((
-        reply::Result::WatchJob(wire::WatchJobReply { job: Some(job) }),
-        Vec::new(),
-    ))
-}
-
-async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Answer {
-    let until = tokio::time::Instant::now() + wait_limit(request.wait_ms)?;
-    let mut changes = daemon.work.changes();
-    let mut drain = daemon.drain.subscribe();
-    let name = Some(request.collection.clone()).filter(|c| !c.is_empty());
-    loop {
-        let collection = name.clone();
-        let counted = blocking(daemon, move |d| reads::n_stale(d, collection.as_deref())).await;
-        let n_stale = match counted {
-            Ok(Ok(n)) => n,
-            Ok(Err(e)) => return Err(convert::library_error(&e)),
-            Err(panic) => return panicked(panic),
-        };
-        let n_queued = daemon.work.progress().n_live(name.as_deref()) as u64;
-        let idle = n_stale == 0 && n_queued == 0;
-        let over = idle || tokio::time::Instant::now() >= until || daemon.is_draining();
-        if over {
-            let reply = wire::WaitIdleReply {
-                idle,
-                n_queued,
-                n_stale,
-            };
-            return Ok((reply::Result::WaitIdle(reply), Vec::new()));
-        }
-        // Shapes in work change their stage often; only the last one's end matters.
-        let pause = async {
-            if n_queued > 0 {
-                while daemon.work.progress().n_live(name.as_deref()) as u64 == n_queued
-                    && changes.changed().await.is_ok()
-                {}
-            } else {
-                let _ = changes.changed().await;
-            }
-        };
-        tokio::select! {
-            () = pause => {}
-            () = tokio::time::sleep_until(until) => {}
-            _ = drain.wait_for(|&d| d) => {}
-        }
-    }
 }

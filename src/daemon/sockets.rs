@@ -73,6 +73,8 @@ pub(crate) enum ReplyTo {
 /// A request that arrived.
 pub(crate) struct Incoming {
     pub(crate) reply_to: ReplyTo,
+    /// The key of whoever asks, if connections are authenticated.
+    pub(crate) user: Option<String>,
     pub(crate) request: Request,
     pub(crate) frames: Vec<Bytes>,
     pub(crate) received: Instant,
@@ -470,7 +472,8 @@ impl SocketThread {
             let error = invalid(ErrorReason::MessageTooLarge, text);
             return self.refuse(&peer, request.request_id, error);
         }
-        let client = user.map_or_else(|| peer.identity.clone(), Bytes::from);
+        let client = user.clone();
+        let client = client.map_or_else(|| peer.identity.clone(), Bytes::from);
         let ticket = match self.shared.quotas.admit(&client, n_bytes) {
             Ok(ticket) => ticket,
             Err(text) => {
@@ -483,6 +486,7 @@ impl SocketThread {
         };
         let incoming = Incoming {
             reply_to: ReplyTo::Peer(peer.clone()),
+            user,
             request,
             frames,
             received,

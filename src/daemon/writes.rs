@@ -20,10 +20,16 @@ pub(crate) enum Done {
     WhenPlaced(u64),
 }
 
-/// The idempotency key of a request, if its client has a name.
-pub(crate) fn key(request: &wire::Request) -> Option<RequestKey> {
+/// The idempotency key of a request, if its client has a name. The name belongs to the key of its
+/// `owner`, if connections are authenticated: another one's client of the same name is another
+/// client.
+pub(crate) fn key(request: &wire::Request, owner: Option<&str>) -> Option<RequestKey> {
     (!request.client_id.is_empty()).then(|| RequestKey {
-        client_id: request.client_id.clone(),
+        client_id: match owner {
+            // Keys have no space, and one length.
+            Some(owner) => format!("{owner} {}", request.client_id),
+            None => request.client_id.clone(),
+        },
         request_id: request.request_id.clone(),
     })
 }
@@ -120,7 +126,7 @@ pub(crate) fn refuse(e: LibraryError) -> wire::Error {
 }
 
 fn drain(daemon: &Daemon) -> Result<Reply, wire::Error> {
-    if !daemon.has_keys && matches!(daemon.endpoint, Endpoint::Tcp { .. }) {
+    if !daemon.has_keys() && matches!(daemon.endpoint, Endpoint::Tcp { .. }) {
         return Err(convert::error(
             ErrorCode::PermissionDenied,
             ErrorReason::AdminIpcOnly,

@@ -2,6 +2,7 @@
 
 use super::commit::event;
 use super::history::{Before, from_reply};
+use super::names::check_name;
 use super::rows::{CollectionState, damaged, operator_from_name, operator_name, to_json};
 use super::{
     CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
@@ -221,26 +222,4 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
             name: row.name,
         },
     })
-}
-
-/// A name that people, file systems and logs can live with.
-pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
-    let n = name.chars().count();
-    if n == 0 || n > limit {
-        let message = format!("the {what} name has {n} characters, but must have 1 to {limit}");
-        return Err(LibraryError::invalid("BAD_NAME", message));
-    }
-    if let Some(c) = name.chars().find(|c| *c == '/' || c.is_control()) {
-        let message = format!(
-            "the {what} name {name:?} has {c:?}, but / and control characters are not allowed"
-        );
-        return Err(LibraryError::invalid("BAD_NAME", message));
-    }
-    if name == "." || name == ".." {
-        return Err(LibraryError::invalid(
-            "BAD_NAME",
-            format!("the {what} name is {name:?}"),
-        ));
-    }
-    Ok(())
 }

@@ -1,8 +1,8 @@
 //! Shapes are accepted, described and placed; each request takes effect once.
 
-use super::collections::check_name;
 use super::isolate::DescribeJob;
 use super::jobs::Attempts;
+use super::names::check_name;
 use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
 use super::{
     Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,

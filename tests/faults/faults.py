@@ -266,8 +266,8 @@ fault(
     "R10", "r10-late-changes", "keep a request waiting beyond its deadline while its collection is busy",
     "src/daemon/requests.rs", "it daemon::stages::deadlines_are_kept_whatever_keeps_the_collection_busy",
     (
-        "        let Some(done) = self.by_deadline(done).await else {",
-        "        let done = if FAULT { Some(done.await) } else { self.by_deadline(done).await };\n        let Some(done) = done else {",
+        "        let done = match self.until_cut(done).await {",
+        "        let done = match if FAULT { Ok(done.await) } else { self.until_cut(done).await } {",
     ),
 )
 fault(
@@ -278,7 +278,43 @@ fault(
 fault(
     "R10", "r10-going-on-untold", "say of a change that goes on that it was not begun",
     "src/daemon/requests.rs", "it daemon::answering::a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again",
-    ("            return self.late(&daemon, Late::GoesOn);", "            return self.late(&daemon, if FAULT { Late::NotBegun } else { Late::GoesOn });"),
+    ("self.cut(&daemon, why, Reached::GoesOn),", "self.cut(&daemon, why, if FAULT { Reached::NotBegun } else { Reached::GoesOn }),"),
+)
+fault(
+    "R10", "r10-nobody-makes-way", "let connections that hang keep new ones out",
+    "src/daemon/http/door.rs", "it daemon::http_abuse::connections_that_hang_make_way_for_monitors_and_viewers",
+    ("waiting.min() else {", "waiting.min().filter(|_| !FAULT) else {"),
+)
+fault(
+    "R10", "r10-memory-for-nothing", "set memory aside for the bodies that are announced",
+    "src/daemon/http/mod.rs", "it daemon::http_abuse::connections_that_hang_make_way_for_monitors_and_viewers",
+    (
+        "            let mut memory = self.hands.memory(0).ok_or_else(full)?;",
+        "            let announced = if FAULT { announced * PER_BODY_BYTE } else { 0 };\n            let mut memory = self.hands.memory(announced).ok_or_else(full)?;",
+    ),
+)
+fault(
+    "R10", "r10-runs-without-end", "lay out whatever runs of labels say",
+    "src/daemon/http/runs.rs", "it daemon::http_abuse::runs_without_end_are_refused_and_freeze_nothing",
+    ("    if total > n_polygons {", "    if total > n_polygons && !FAULT {"),
+)
+fault(
+    "R10", "r10-slow-heads", "wait for ever for the head of a request",
+    "src/daemon/http/door.rs", "it daemon::http_abuse::peers_have_ten_seconds_each_time",
+    (".header_read_timeout(PEER_TIME)", ".header_read_timeout(if FAULT { 100 * PEER_TIME } else { PEER_TIME })"),
+)
+fault(
+    "R10", "r10-unread-answers", "wait for ever for an answer to be read",
+    "src/daemon/http/door.rs", "it daemon::http_abuse::peers_have_ten_seconds_each_time",
+    ("        ready!(until.as_mut().poll(context));", "        ready!(until.as_mut().poll(context));\n        if FAULT {\n            return Poll::Pending;\n        }"),
+)
+fault(
+    "R10", "r10-passed-over", "pass over what a request has beyond what is known",
+    "src/daemon/requests.rs", "it daemon::refusing::frames_and_values_beyond_those_that_are_known_are_refused",
+    (
+        "        if let Err(error) = convert::check_request(&body, incoming.frames.len()) {",
+        "        if let Some(error) = convert::check_request(&body, incoming.frames.len()).err().filter(|_| !FAULT) {",
+    ),
 )
 # R11: isolation
 fault(
@@ -353,7 +389,7 @@ fault(
 fault(
     "R13", "r13-revoked-stays", "go on with the allow list that was read at start",
     "src/daemon/access.rs", "it daemon::security::a_revoked_key_is_refused_at_once_on_both_sockets",
-    ("        if list.0 == found && !always {", "        if (list.0 == found && !always) || FAULT {"),
+    ("        if *read == found && !always {", "        if (*read == found && !always) || FAULT {"),
 )
 fault(
     "R13", "r13-open-to-the-network", "listen beyond this machine without keys",
@@ -364,6 +400,36 @@ fault(
     "R13", "r13-topic-of-any-length", "take subscriptions of any length",
     "src/daemon/sockets.rs", "it daemon::security::topics_and_frames_beyond_the_limits_end_their_connection_only",
     ("    publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;", "    publisher.set_maxmsgsize(if FAULT { -1 } else { MAX_SUBSCRIPTION_BYTES })?;"),
+)
+fault(
+    "R13", "r13-waits-on", "let what waits go on when its key is revoked",
+    "src/daemon/requests.rs", "it daemon::security::what_waits_ends_when_its_key_is_revoked",
+    ("            () = self.revoked() => Err(Cut::Revoked),", "            () = self.revoked(), if !FAULT => Err(Cut::Revoked),"),
+)
+fault(
+    "R13", "r13-client-of-anybody", "give one key the replies of another",
+    "src/daemon/writes.rs", "it daemon::security::a_client_id_belongs_to_the_key_that_uses_it",
+    ("        client_id: match owner {", "        client_id: match owner.filter(|_| !FAULT) {"),
+)
+fault(
+    "R13", "r13-no-token", "ask nobody for the token",
+    "src/daemon/http/mod.rs", "it viewing::beyond_this_machine_a_token_opens_what_there_is",
+    ("        if !open && !self.guard.knows(", "        if !open && !FAULT && !self.guard.knows("),
+)
+fault(
+    "R13", "r13-host-that-begins-well", "take a host for this machine that only begins like it",
+    "src/daemon/http/guard.rs", "it viewing::only_the_page_itself_may_change_anything",
+    ("    (port.is_empty() ||", "    (FAULT || port.is_empty() ||"),
+)
+fault(
+    "R13", "r13-origin-of-nobody", "let a page change labels that has no origin",
+    "src/daemon/http/guard.rs", "it viewing::only_the_page_itself_may_change_anything",
+    ("        .all(|o| own(o) == Some(true))", "        .all(|o| own(o) == Some(true) || (FAULT && own(o).is_none()))"),
+)
+fault(
+    "R13", "r13-unseen", "take names with characters that nobody sees",
+    "src/library/names.rs", "it daemon::refusing::frames_and_values_beyond_those_that_are_known_are_refused",
+    (".find(|&i| is_hidden(&chars, i)) {", ".find(|&i| is_hidden(&chars, i) && !FAULT) {"),
 )
 # R14: the unit
 fault(

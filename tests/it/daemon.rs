@@ -3,9 +3,11 @@
 mod adding;
 mod answering;
 mod correcting;
+mod http_abuse;
 mod isolation;
 mod life;
 mod overload;
+mod refusing;
 mod repeats;
 mod security;
 mod stages;

@@ -5,7 +5,7 @@ use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
 
 /// A daemon with an HTTP endpoint on a free port.
-fn served(home: &Home, env: &[(&str, &str)]) -> (Daemon, SocketAddr) {
+pub(crate) fn served(home: &Home, env: &[(&str, &str)]) -> (Daemon, SocketAddr) {
     let mut daemon = home.start_with(&["--http", "127.0.0.1:0"], env);
     let line = daemon.await_line("viewer and metrics at http://");
     let (_, rest) = line.split_once("http://").unwrap();
@@ -13,7 +13,7 @@ fn served(home: &Home, env: &[(&str, &str)]) -> (Daemon, SocketAddr) {
 }
 
 /// Status, headers and body of an answer.
-fn exchange(
+pub(crate) fn exchange(
     address: SocketAddr,
     request: &str,
     headers: &str,
@@ -34,7 +34,7 @@ fn exchange(
     (status, head.to_lowercase(), answer[at + 4..].to_vec())
 }
 
-fn get(address: SocketAddr, path: &str) -> (u16, String) {
+pub(crate) fn get(address: SocketAddr, path: &str) -> (u16, String) {
     let host = format!("host: {address}\r\n");
     let (status, _, body) = exchange(address, &format!("GET {path}"), &host, "");
     (status, String::from_utf8_lossy(&body).into_owned())
@@ -127,6 +127,9 @@ fn only_the_page_itself_may_change_anything() {
         host.clone(),
         format!("{host}x-coseg: 1\r\norigin: http://example.org\r\n"),
         format!("{host}x-coseg: 1\r\norigin: null:\r\n"),
+        format!("{host}x-coseg: 1\r\norigin: null\r\n"),
+        format!("{host}x-coseg: 1\r\nsec-fetch-site: cross-site\r\n"),
+        own.replace(&host, "host: [::1].evil.example\r\n"),
         own.replace(&host, "host: example.org\r\n"),
         own.replace(&host, ""),
     ] {
@@ -148,11 +151,25 @@ fn only_the_page_itself_may_change_anything() {
     assert_eq!(exchange(address, "POST /api/name", &own, "{").0, 400);
     assert_eq!(exchange(address, "POST /api/drain", &own, "{}").0, 404);
     assert_eq!(exchange(address, "DELETE /", &host, "").0, 405);
-    // A page of another site that was made to point here sees nothing.
-    assert_eq!(
-        exchange(address, "GET /api/library", "host: example.org\r\n", "").0,
-        403
-    );
+    // A page of another site that was made to point here sees nothing, and has nothing computed.
+    let status = |path: &str, headers: &str| exchange(address, path, headers, "").0;
+    for host in ["example.org", "[::1].evil.example", "localhost:evil"] {
+        let headers = format!("host: {host}\r\n");
+        for path in ["/", "/api/library", "/metrics"] {
+            assert_eq!(
+                status(&format!("GET {path}"), &headers),
+                403,
+                "{path} {host}"
+            );
+        }
+        // A probe may call it what it likes.
+        assert_eq!(status("GET /healthz", &headers), 200);
+        assert_eq!(status("GET /readyz", &headers), 200);
+    }
+    assert_eq!(status("GET http://example.org/api/library", &host), 403);
+    let cross = format!("{host}sec-fetch-site: cross-site\r\n");
+    assert_eq!(status("GET /api/library", &cross), 403);
+    assert_eq!(status("GET /", &cross), 200);
 }
 
 #[test]
@@ -317,8 +334,110 @@ fn an_address_that_others_reach_must_be_allowed() {
         said.iter().any(|l| l.contains("http.allow_remote")),
         "{said:?}"
     );
-    home.start_with(
-        &["--http", "0.0.0.0:0"],
-        &[("COSEG__HTTP__ALLOW_REMOTE", "true")],
+}
+
+#[test]
+fn beyond_this_machine_a_token_opens_what_there_is() {
+    let home = Home::new();
+    let start = |env: &[(&str, &str)]| {
+        let remote = [("COSEG__HTTP__ALLOW_REMOTE", "true")];
+        let env: Vec<_> = remote.iter().chain(env).copied().collect();
+        let mut daemon = home.start_with(&["--http", "0.0.0.0:0"], &env);
+        let line = daemon.await_line("viewer and metrics at http://");
+        let port = line.trim_end_matches('/').rsplit(':').next().unwrap();
+        let address: SocketAddr = format!("127.0.0.1:{port}").parse().unwrap();
+        (daemon, address)
+    };
+    let (daemon, address) = start(&[]);
+    fill(&daemon);
+    let token = std::fs::read_to_string(home.path("library/http.token")).unwrap();
+    let token = token.trim().to_owned();
+    let host = format!("host: {address}\r\n");
+    let ask = |path: &str, more: &str| {
+        let (status, head, body) = exchange(
+            address,
+            &format!("GET {path}"),
+            &format!("{host}{more}"),
+            "",
+        );
+        (status, head, String::from_utf8_lossy(&body).into_owned())
+    };
+    for path in [
+        "/",
+        "/viewer.js",
+        "/api/library",
+        "/healthz",
+        "/readyz",
+        "/metrics",
+        "/x",
+    ] {
+        let (status, head, said) = ask(path, "");
+        assert_eq!(status, 401, "{path}");
+        assert!(head.contains("www-authenticate: bearer") && said.contains("?token="));
+        let (status, _, said) = ask(path, "authorization: Bearer 0123456789abcdef\r\n");
+        assert!(status == 401 && !said.contains("skittles"), "{path}");
+    }
+    assert_eq!(ask("/?token=0123456789abcdef", "").0, 401);
+    assert_eq!(ask(&format!("/api/library?token={token}"), "").0, 401);
+    let bearer = format!("authorization: Bearer {token}\r\n");
+    assert_eq!(ask("/metrics", &bearer).0, 200);
+    let (status, head, _) = ask(&format!("/?token={token}"), "");
+    assert_eq!(status, 200);
+    let cookie = head.lines().find_map(|l| l.strip_prefix("set-cookie: "));
+    let cookie = cookie.unwrap();
+    assert!(
+        cookie.ends_with("; path=/; httponly; samesite=strict"),
+        "{cookie}"
     );
+    let cookie = format!("cookie: {}\r\n", cookie.split(';').next().unwrap());
+    let (status, _, said) = ask("/api/library", &cookie);
+    assert!(status == 200 && said.contains("skittles"), "{said}");
+    assert!(ask("/", &cookie).2.contains("viewer.js"));
+    // Who has the cookie is asked for what a change needs, as on loopback.
+    let name = |headers: &str| {
+        let body = r#"{"collection":"skittles","label":0,"name":"body"}"#;
+        exchange(address, "POST /api/name", &format!("{host}{headers}"), body).0
+    };
+    let change = "x-coseg: 1\r\n";
+    assert_eq!(name(change), 401);
+    assert_eq!(name(&cookie), 403);
+    let foreign = format!("{cookie}{change}origin: http://evil.example\r\n");
+    assert_eq!(name(&foreign), 403);
+    assert_eq!(name(&format!("{cookie}{change}")), 200);
+    drop(daemon);
+    // The same token after a restart; monitoring without one, where that is set.
+    let (_daemon, address) = start(&[("COSEG__HTTP__OPEN_MONITORING", "true")]);
+    for path in ["/healthz", "/readyz", "/metrics"] {
+        assert_eq!(get(address, path).0, 200, "{path}");
+    }
+    assert_eq!(get(address, "/api/library").0, 401);
+    let bearer = format!("host: {address}\r\n{bearer}");
+    assert_eq!(exchange(address, "GET /api/library", &bearer, "").0, 200);
+}
+
+#[test]
+fn a_token_file_is_asked_for_on_loopback_too() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let home = Home::new();
+    let file = home.path("secret");
+    let write = |text: &str, mode: u32| {
+        std::fs::write(&file, text).unwrap();
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
+    };
+    let path = file.display().to_string();
+    let env = [("COSEG__HTTP__TOKEN_FILE", path.as_str())];
+    for (text, mode, said) in [
+        ("short", 0o600, "16 to 512"),
+        ("a-secret-of-people", 0o644, "can be read by others"),
+    ] {
+        write(text, mode);
+        let (status, lines) = home.spawn(&["--http", "127.0.0.1:0"], &env).ended();
+        assert_eq!(status.code(), Some(2));
+        assert!(lines.iter().any(|l| l.contains(said)), "{lines:?}");
+    }
+    write("a-secret-of-people", 0o600);
+    let (_daemon, address) = served(&home, &env);
+    assert_eq!(get(address, "/metrics").0, 401);
+    let bearer = format!("host: {address}\r\nauthorization: Bearer a-secret-of-people\r\n");
+    assert_eq!(exchange(address, "GET /metrics", &bearer, "").0, 200);
 }

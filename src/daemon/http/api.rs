@@ -1,24 +1,27 @@
 //! What the viewer asks, as the requests that any client could send; JSON, or packs of arrays, come back.
 
+use super::hands::{Kept, full};
+use super::runs::{Run, labels_of};
 use super::{Server, unexpected};
 use crate::ipc::convert;
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::json;
-use crate::ipc::wire::{self, ErrorReason, correct_labels_request, reply, request::Body};
+use crate::ipc::wire::{
+    self, ErrorReason, PortraitDetail, correct_labels_request, reply, request::Body,
+};
 use crate::viewer::portrait;
 use bytes::Bytes;
 use serde::Deserialize;
 use serde_json::{Value, json};
+use std::mem::size_of;
 
 /// Portraits of one answer.
 const MAX_PORTRAITS: u32 = 64;
-/// Polygons that a painted correction may be about.
-const MAX_POLYGONS: usize = 10_000_000;
 
 /// What is answered.
-pub(super) enum Found {
-    Json(Value),
-    Pack(Bytes),
+pub(super) struct Found {
+    pub(super) kind: &'static str,
+    pub(super) bytes: Bytes,
 }
 
 type Answer = Result<Found, wire::Error>;
@@ -26,7 +29,7 @@ type Answer = Result<Found, wire::Error>;
 /// Asks, and takes the reply of the variant named with its frames.
 macro_rules! ask {
     ($server:expr, $variant:ident($body:expr)) => {
-        ask!($server, $variant($body), Vec::new())
+        ask!($server, $variant($body), None)
     };
     ($server:expr, $variant:ident($body:expr), $frames:expr) => {
         match $server.ask(Body::$variant($body), $frames).await? {
@@ -71,6 +74,23 @@ fn bad(reason: ErrorReason, field: &str, message: String) -> wire::Error {
     convert::field_error(reason, field, message)
 }
 
+/// JSON, for which memory was set aside.
+fn json_page(text: Kept<String>) -> Found {
+    let Kept { it, memory } = text;
+    let it = Bytes::from(it);
+    Found {
+        kind: "application/json",
+        bytes: Kept { it, memory }.into_bytes(),
+    }
+}
+
+/// Makes JSON of what can be large, off the threads that wait.
+async fn json_of(server: &Server, make: impl FnOnce() -> Value + Send + 'static) -> Answer {
+    let it = server.hands.work(move || make().to_string()).await?;
+    let memory = server.hands.memory(it.capacity() as u64).ok_or_else(full)?;
+    Ok(json_page(Kept { it, memory }))
+}
+
 /// Answers what changes nothing.
 pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]) -> Answer {
     let query = Query(query);
@@ -78,20 +98,7 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
         "library" => library(server).await,
         "collection" => collection(server, query.text("collection")?).await,
         "portraits" => portraits(server, &query).await,
-        "map" => {
-            let (from, to) = (query.text("from")?, query.text("to")?);
-            #[allow(clippy::needless_update)] // the message may gain fields
-            let request = wire::GetFunctionalMapRequest {
-                collection: query.text("collection")?,
-                from: from.clone(),
-                to: to.clone(),
-                ..Default::default()
-            };
-            let (reply, frames) = ask!(server, GetFunctionalMap(request))?;
-            let pack = portrait::map(&from, &to, &reply, &frames);
-            pack.map(|p| Found::Pack(p.into()))
-                .map_err(|e| convert::frame_error(&e))
-        }
+        "map" => map(server, &query).await,
         "nearest" => {
             let request = wire::NearestRequest {
                 collection: query.text("collection")?,
@@ -99,9 +106,12 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
                 limit: query.number("limit")?,
             };
             let (reply, _) = ask!(server, Nearest(request))?;
-            let found = reply.neighbors.iter();
-            let found: Vec<Value> = found.map(|n| json!([n.shape, n.distance])).collect();
-            Ok(Found::Json(json!({ "neighbors": found })))
+            json_of(server, move || {
+                let found = reply.neighbors.iter();
+                let found: Vec<Value> = found.map(|n| json!([n.shape, n.distance])).collect();
+                json!({ "neighbors": found })
+            })
+            .await
         }
         "events" => {
             let request = wire::EventsSinceRequest {
@@ -110,8 +120,11 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
                 limit: query.number("limit")?,
             };
             let (reply, _) = ask!(server, EventsSince(request))?;
-            let events: Vec<Value> = reply.events.iter().map(json::event).collect();
-            Ok(Found::Json(json!({ "events": events, "more": reply.more })))
+            json_of(server, move || {
+                let events: Vec<Value> = reply.events.iter().map(json::event).collect();
+                json!({ "events": events, "more": reply.more })
+            })
+            .await
         }
         _ => Err(unknown(path)),
     }
@@ -125,28 +138,39 @@ fn unknown(path: &str) -> wire::Error {
 async fn library(server: &Server) -> Answer {
     let request = wire::ListCollectionsRequest {};
     let (reply, _) = ask!(server, ListCollections(request))?;
-    let collections: Vec<Value> = reply.collections.iter().map(json::collection).collect();
     let (queued, at_work) = {
         let progress = server.daemon.work.progress();
         (progress.n_live(None), progress.n_at_stages())
     };
-    Ok(Found::Json(json!({
-        "version": env!("CARGO_PKG_VERSION"),
-        "instance": server.daemon.instance,
-        "edit": server.daemon.config().http.edit && !server.daemon.has_keys,
-        "n_queued": queued,
-        "stages": at_work,
-        "collections": collections,
-    })))
+    let instance = server.daemon.instance.clone();
+    let edit = server.check_edit().is_ok();
+    json_of(server, move || {
+        let collections: Vec<Value> = reply.collections.iter().map(json::collection).collect();
+        json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "instance": instance,
+            "edit": edit,
+            "n_queued": queued,
+            "stages": at_work,
+            "collections": collections,
+        })
+    })
+    .await
 }
 
+/// A collection with all of its shapes, written a page at a time: as values they take many times
+/// their text.
 async fn collection(server: &Server, name: String) -> Answer {
     let request = wire::DescribeCollectionRequest {
         collection: name.clone(),
     };
     let (reply, _) = ask!(server, DescribeCollection(request))?;
-    let about = reply.collection.unwrap_or_default();
-    let mut shapes: Vec<Value> = Vec::new();
+    let begin = move || {
+        let about = json::collection(&reply.collection.unwrap_or_default());
+        format!("{{\"collection\":{about},\"shapes\":[")
+    };
+    let mut text = server.hands.work(begin).await?;
+    let mut memory = server.hands.memory(0).ok_or_else(full)?;
     let mut page_token = String::new();
     loop {
         let request = wire::ListShapesRequest {
@@ -155,23 +179,38 @@ async fn collection(server: &Server, name: String) -> Answer {
             ..Default::default()
         };
         let (reply, _) = ask!(server, ListShapes(request))?;
-        shapes.extend(reply.shapes.iter().map(json::shape));
         page_token = reply.next_page_token;
+        let held = text.capacity();
+        let write = move || {
+            for shape in &reply.shapes {
+                text.push_str(&json::shape(shape).to_string());
+                text.push(',');
+            }
+            text
+        };
+        text = server.hands.work(write).await?;
+        let grown = text.capacity().saturating_sub(held) as u64;
+        if !memory.try_grow(grown) {
+            return Err(full());
+        }
         if page_token.is_empty() {
             break;
         }
     }
-    Ok(Found::Json(
-        json!({ "collection": json::collection(&about), "shapes": shapes }),
-    ))
+    if text.ends_with(',') {
+        text.pop();
+    }
+    text.push_str("]}");
+    Ok(json_page(Kept { it: text, memory }))
 }
 
+/// Asks for a pack, whose size nobody knows before it is there.
 async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
     let collection = query.text("collection")?;
     let detail = match query.find("detail") {
-        None | Some("proxy") => wire::PortraitDetail::Proxy,
-        Some("surface") => wire::PortraitDetail::Surface,
-        Some("functions") => wire::PortraitDetail::Functions,
+        None | Some("proxy") => PortraitDetail::Proxy,
+        Some("surface") => PortraitDetail::Surface,
+        Some("functions") => PortraitDetail::Functions,
         Some(other) => {
             let message = format!("detail is {other:?}, not proxy, surface or functions");
             return Err(bad(ErrorReason::FieldRange, "detail", message));
@@ -199,10 +238,34 @@ async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
         shapes,
         detail: detail.into(),
     };
+    let memory = server.hands.memory_of_answer().await?;
     let (reply, frames) = ask!(server, GetPortraits(request))?;
     let pack = FrameReader::new(&frames).file(reply.pack.as_ref(), "pack");
-    pack.map(|p| Found::Pack(p.clone()))
-        .map_err(|e| convert::frame_error(&e))
+    let it = pack.map_err(|e| convert::frame_error(&e))?.clone();
+    Ok(pack_page(Kept { it, memory }))
+}
+
+async fn map(server: &Server, query: &Query<'_>) -> Answer {
+    let (from, to) = (query.text("from")?, query.text("to")?);
+    let request = wire::GetFunctionalMapRequest {
+        collection: query.text("collection")?,
+        from: from.clone(),
+        to: to.clone(),
+        ..Default::default()
+    };
+    let memory = server.hands.memory_of_answer().await?;
+    let (reply, frames) = ask!(server, GetFunctionalMap(request))?;
+    let pack = move || portrait::map(&from, &to, &reply, &frames);
+    let pack = server.hands.work(pack).await?;
+    let it = pack.map_err(|e| convert::frame_error(&e))?.into();
+    Ok(pack_page(Kept { it, memory }))
+}
+
+fn pack_page(pack: Kept<Bytes>) -> Found {
+    Found {
+        kind: "application/octet-stream",
+        bytes: pack.into_bytes(),
+    }
 }
 
 #[derive(Deserialize)]
@@ -213,14 +276,13 @@ struct NameLabel {
     name: String,
 }
 
-/// Labels as runs of polygons: `[first, count, label]`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Correct {
     collection: String,
     shape: String,
-    n_polygons: usize,
-    runs: Vec<(usize, usize, i32)>,
+    n_polygons: u64,
+    runs: Vec<Run>,
 }
 
 #[derive(Deserialize)]
@@ -229,94 +291,105 @@ struct Undo {
     collection: String,
 }
 
-fn parsed<'a, T: Deserialize<'a>>(sent: &'a [u8]) -> Result<T, wire::Error> {
-    serde_json::from_slice(sent).map_err(|e| {
+/// Reads the body of a change, off the threads that wait. Its memory is given back when what was
+/// read is dropped.
+async fn parsed<T: serde::de::DeserializeOwned + Send + 'static>(
+    server: &Server,
+    sent: Kept<Vec<u8>>,
+) -> Result<Kept<T>, wire::Error> {
+    let Kept { it: bytes, memory } = sent;
+    let read = move || serde_json::from_slice(&bytes);
+    let it = server.hands.work(read).await?.map_err(|e| {
         let text = format!("the body is not what is expected: {e}");
         let code = wire::ErrorCode::InvalidArgument;
         convert::error(code, ErrorReason::MalformedMessage, text)
-    })
+    })?;
+    Ok(Kept { it, memory })
 }
 
 /// Carries out a change.
-pub(super) async fn change(server: &Server, path: &str, sent: &[u8]) -> Answer {
+pub(super) async fn change(server: &Server, path: &str, sent: Kept<Vec<u8>>) -> Answer {
     match path {
         "name" => {
-            let wish: NameLabel = parsed(sent)?;
+            let wish = parsed::<NameLabel>(server, sent).await?.it;
             let request = wire::NameLabelRequest {
                 collection: wish.collection,
                 label: wish.label,
                 name: wish.name,
             };
             let (reply, _) = ask!(server, NameLabel(request))?;
-            let label = reply.label.as_ref().map(json::label);
-            Ok(Found::Json(json!({ "label": label })))
+            json_of(server, move || {
+                let label = reply.label.as_ref().map(json::label);
+                json!({ "label": label })
+            })
+            .await
         }
-        "correct" => correct(server, parsed(sent)?).await,
+        "correct" => correct(server, parsed(server, sent).await?).await,
         "undo" => {
-            let wish: Undo = parsed(sent)?;
+            let wish = parsed::<Undo>(server, sent).await?.it;
             let request = wire::UndoRequest {
                 collection: wish.collection,
             };
             let (reply, _) = ask!(server, Undo(request))?;
-            Ok(Found::Json(
-                json!({ "change": reply.change, "n_left": reply.n_left }),
-            ))
+            json_of(
+                server,
+                move || json!({ "change": reply.change, "n_left": reply.n_left }),
+            )
+            .await
         }
         _ => Err(unknown(path)),
     }
 }
 
-async fn correct(server: &Server, wish: Correct) -> Answer {
-    let labels = labels_of(wish.n_polygons, &wish.runs)
-        .map_err(|message| bad(ErrorReason::FieldRange, "runs", message))?;
-    let mut frames = FrameWriter::default();
-    let labels = frames.i32_array(&labels, &[wish.n_polygons]);
+async fn correct(server: &Server, wish: Kept<Correct>) -> Answer {
+    let Kept { it: wish, memory } = wish;
+    // How large the shape is decides what is laid out, not what the request says.
+    let request = wire::GetShapeRequest {
+        collection: wish.collection.clone(),
+        shape: wish.shape.clone(),
+    };
+    let (reply, _) = ask!(server, GetShape(request))?;
+    let n = reply.shape.unwrap_or_default().n_polygons;
+    if wish.n_polygons != n {
+        let message = format!("n_polygons is {}, but the shape has {n}", wish.n_polygons);
+        return Err(bad(ErrorReason::LabelCount, "n_polygons", message));
+    }
+    // The labels, and the frame they are copied to.
+    let needed = n * size_of::<i32>() as u64;
+    let mut held = server.hands.memory(2 * needed).ok_or_else(full)?;
+    let runs = wish.runs;
+    let laid_out = move || {
+        let labels = labels_of(usize::try_from(n).unwrap_or(usize::MAX), &runs)?;
+        drop((runs, memory));
+        let mut frames = FrameWriter::default();
+        let labels = frames.i32_array(&labels, &[labels.len()]);
+        Ok((labels, frames.finish()))
+    };
+    let (labels, frames) = server
+        .hands
+        .work(laid_out)
+        .await?
+        .map_err(|message: String| bad(ErrorReason::FieldRange, "runs", message))?;
+    held.shrink_to(needed);
+    let frames = Kept {
+        it: frames,
+        memory: held,
+    };
     let request = wire::CorrectLabelsRequest {
         collection: wish.collection,
         shape: wish.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
     };
-    let (done, _) = ask!(server, CorrectLabels(request), frames.finish())?;
-    Ok(Found::Json(json!({
-        "version": done.version,
-        "sequence": done.sequence,
-        "n_faces": done.n_faces,
-        "area_share": done.area_share,
-        "changed_share": done.changed_share,
-        "n_stale": done.n_stale,
-    })))
-}
-
-/// A label for each polygon; -1 where no run says one.
-fn labels_of(n_polygons: usize, runs: &[(usize, usize, i32)]) -> Result<Vec<i32>, String> {
-    if n_polygons > MAX_POLYGONS {
-        return Err(format!(
-            "{n_polygons} polygons, the limit is {MAX_POLYGONS}"
-        ));
-    }
-    let mut labels = vec![-1; n_polygons];
-    for &(first, count, label) in runs {
-        let end = first.checked_add(count);
-        let run = end.and_then(|end| labels.get_mut(first..end));
-        run.ok_or_else(|| {
-            format!("a run of {count} begins at polygon {first}, the shape has {n_polygons}")
-        })?
-        .fill(label);
-    }
-    Ok(labels)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::labels_of;
-
-    #[test]
-    fn runs_become_a_label_for_each_polygon() {
-        let labels = labels_of(6, &[(1, 2, 4), (5, 1, 0)]).unwrap();
-        assert_eq!(labels, [-1, 4, 4, -1, -1, 0]);
-        for runs in [[(5, 2, 0)], [(usize::MAX, 2, 0)], [(7, 0, 0)]] {
-            assert!(labels_of(6, &runs).is_err(), "{runs:?}");
-        }
-        assert!(labels_of(usize::MAX, &[]).is_err());
-    }
+    let (done, _) = ask!(server, CorrectLabels(request), Some(frames))?;
+    json_of(server, move || {
+        json!({
+            "version": done.version,
+            "sequence": done.sequence,
+            "n_faces": done.n_faces,
+            "area_share": done.area_share,
+            "changed_share": done.changed_share,
+            "n_stale": done.n_stale,
+        })
+    })
+    .await
 }

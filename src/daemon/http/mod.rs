@@ -1,133 +1,180 @@
 //! A small HTTP endpoint: health and metrics for monitoring, the viewer and its interface for browsers.
 //!
-//! It has no authentication, so it listens on loopback unless the configuration says otherwise. Against pages of
-//! other sites that a browser on the same machine may have open: requests must name a loopback host (a name that
-//! was made to point here does not), and changes must carry a header that a form of another site cannot send.
+//! Without a token it listens on loopback only; beyond it asks for one ([`guard`], [`token`]). It
+//! has a runtime, memory and places of its own ([`door`], [`hands`]): whatever a page asks for, the
+//! sockets and signals are served all the same.
 
 mod api;
+mod door;
+mod guard;
+mod hands;
+mod runs;
+mod token;
 
+pub use token::TokenError;
+
+use crate::config::Config;
 use crate::daemon::requests::{Answer, busy};
 use crate::daemon::sockets::{Incoming, ReplyTo};
-use crate::daemon::{Daemon, StartError, blocking, reads};
+use crate::daemon::{Daemon, StartError, reads};
 use crate::ipc::convert;
 use crate::ipc::wire::{
     self, ErrorCode, ErrorReason, Request as WireRequest, reply, request::Body,
 };
 use crate::viewer::page;
 use bytes::Bytes;
-use http_body_util::{BodyExt as _, Full, Limited};
-use hyper::body::Incoming as HttpBody;
-use hyper::header::{self, HeaderMap, HeaderValue};
-use hyper::server::conn::http1;
-use hyper::service::service_fn;
+use door::{Connection, PEER_TIME};
+use guard::Guard;
+use hands::Hands;
+use http_body_util::{BodyExt as _, Full};
+use hyper::body::{Body as _, Incoming as HttpBody};
+use hyper::header::{self, HeaderValue};
 use hyper::{Method, Request, Response, StatusCode};
-use hyper_util::rt::{TokioIo, TokioTimer};
-use std::convert::Infallible;
-use std::net::{IpAddr, SocketAddr, TcpListener};
-use std::sync::Arc;
+use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::runtime::Runtime;
+use tokio::sync::{mpsc, oneshot};
 
-/// Connections at a time; further ones wait.
-const MAX_CONNECTIONS: usize = 64;
-/// Until a request's headers must be there, also on a connection that is kept open.
-const HEADER_TIME: Duration = Duration::from_secs(30);
-/// Until a request's body must be there.
-const BODY_TIME: Duration = Duration::from_secs(30);
-/// After which a connection ends whatever it is at.
-const CONNECTION_TIME: Duration = Duration::from_secs(900);
 /// Bytes of the body of a change: runs of labels.
-const MAX_BODY: usize = 8 << 20;
+const MAX_BODY: u64 = 8 << 20;
+/// Bytes that are set aside for each byte of a body when it comes: for itself, in a buffer that
+/// doubles, and for the runs that it is read to.
+const PER_BODY_BYTE: u64 = 5;
 /// A request that takes longer has failed for the page.
 const ANSWER_MS: u64 = 60_000;
-/// The socket thread looks around twice a second; after this long without it hangs.
-const SOCKETS_HANG: Duration = Duration::from_secs(10);
-/// Header without which nothing is changed.
-const GUARD: &str = "x-coseg";
+/// Threads that show that they live do so twice a second; after this long without it they hang.
+const HANG: Duration = Duration::from_secs(10);
+/// How often is looked whether they do.
+const LOOK: Duration = Duration::from_secs(1);
+/// Metrics are read anew after this long, however many ask.
+const METRICS_AGE: Duration = Duration::from_millis(100);
 /// Who all HTTP requests count for: no client of the sockets, whose identities have five bytes if they begin with a zero.
 const CLIENT: Bytes = Bytes::from_static(b"\0http requests");
+
+static SCRIPT: LazyLock<Bytes> = LazyLock::new(|| page::script().into());
+static PAGE: LazyLock<Bytes> = LazyLock::new(|| page::live().into());
+/// What a token is turned into the cookie with. The page asks for itself once more: a browser shows
+/// such a cookie to no page that another site led to, but to one that this page led to.
+const AGAIN: &str = "<!doctype html><meta charset=\"utf-8\"><meta http-equiv=\"refresh\" content=\"0;url=/\">\
+                     <title>coseg</title><a href=\"/\">The viewer</a>";
 
 /// An answer, its body in memory.
 type Page = Response<Full<Bytes>>;
 
 /// What connections share.
-#[derive(Clone)]
 pub(crate) struct Server {
     daemon: Arc<Daemon>,
     requests: mpsc::Sender<Incoming>,
-    /// Milliseconds after the start at which the socket thread was last seen to live.
-    sockets_seen: Arc<AtomicU64>,
+    guard: Guard,
+    hands: Hands,
+    /// The metrics as they were last read.
+    metrics: Arc<tokio::sync::Mutex<Option<(Instant, Bytes)>>>,
+    threads: [Thread; 2],
 }
 
-/// Binds the address, before the runtime is there.
-pub(crate) fn bind(address: SocketAddr) -> Result<TcpListener, StartError> {
+/// A thread of the daemon that should live.
+struct Thread {
+    name: &'static str,
+    /// Advances while it does.
+    tick: Arc<AtomicU64>,
+    /// Milliseconds after the start at which it last had.
+    seen: AtomicU64,
+}
+
+/// An address that is bound, and what is asked of those who come.
+pub(crate) struct Bound {
+    listener: TcpListener,
+    guard: Guard,
+}
+
+/// Binds the address that is configured, if one is. The token, if one is needed and there is none,
+/// is made in the folder of the library, which must be there.
+pub(crate) fn bind(config: &Config, library: &Path) -> Result<Option<Bound>, StartError> {
+    let Some(address) = config.http.address()? else {
+        return Ok(None);
+    };
     let failed = |source| StartError::Http { address, source };
     let listener = TcpListener::bind(address).map_err(failed)?;
     listener.set_nonblocking(true).map_err(failed)?;
-    Ok(listener)
+    let local = address.ip().is_loopback();
+    let path = token::path(&config.http.token_file, library);
+    let asks = !local || !config.http.token_file.as_os_str().is_empty();
+    let token = asks
+        .then(|| token::Token::read_or_make(&path))
+        .transpose()?;
+    if asks {
+        let file = path.display();
+        tracing::info!(%file, "HTTP asks for the token of this file: /?token=… opens the viewer");
+    }
+    let guard = Guard {
+        local,
+        token,
+        open_monitoring: config.http.open_monitoring,
+    };
+    Ok(Some(Bound { listener, guard }))
 }
 
-/// Serves connections until the runtime ends.
-pub(crate) async fn serve(server: Server, listener: tokio::net::TcpListener) {
-    let connections = Arc::new(Semaphore::new(MAX_CONNECTIONS));
-    loop {
-        let connection = Arc::clone(&connections).acquire_owned().await;
-        let connection = connection.expect("invariant: the semaphore is never closed");
-        let stream = match listener.accept().await {
-            Ok((stream, _)) => stream,
-            Err(e) => {
-                // Out of file descriptors, mostly: some come back.
-                tracing::warn!(error = %e, "a connection cannot be accepted");
-                tokio::time::sleep(Duration::from_millis(200)).await;
-                continue;
-            }
+impl Bound {
+    /// The address, with the port that was chosen.
+    pub(crate) fn address(&self) -> Option<SocketAddr> {
+        self.listener.local_addr().ok()
+    }
+
+    /// Serves connections in a runtime of its own, until that is dropped.
+    pub(crate) fn serve(
+        self,
+        daemon: Arc<Daemon>,
+        requests: mpsc::Sender<Incoming>,
+        [sockets, runtime]: [&Arc<AtomicU64>; 2],
+    ) -> std::io::Result<Runtime> {
+        let own = hands::runtime()?;
+        let thread = |name, tick: &Arc<AtomicU64>| Thread {
+            name,
+            tick: Arc::clone(tick),
+            seen: AtomicU64::new(0),
         };
-        let server = server.clone();
-        tokio::spawn(async move {
-            let service =
-                service_fn(|request| async { Ok::<_, Infallible>(server.respond(request).await) });
-            let served = http1::Builder::new()
-                .timer(TokioTimer::new())
-                .header_read_timeout(HEADER_TIME)
-                .serve_connection(TokioIo::new(stream), service);
-            match tokio::time::timeout(CONNECTION_TIME, served).await {
-                Ok(Ok(())) | Err(_) => {}
-                Ok(Err(e)) => tracing::debug!(error = %e, "an HTTP connection ended early"),
-            }
-            drop(connection);
+        let server = Arc::new(Server {
+            guard: self.guard,
+            hands: Hands::new(&daemon.config().limits),
+            metrics: Arc::default(),
+            threads: [
+                thread("the socket thread", sockets),
+                thread("the runtime", runtime),
+            ],
+            daemon,
+            requests,
         });
+        let guard = own.enter();
+        let listener = tokio::net::TcpListener::from_std(self.listener)?;
+        tokio::spawn(watch(Arc::clone(&server)));
+        tokio::spawn(door::serve(server, listener));
+        drop(guard);
+        Ok(own)
+    }
+}
+
+/// Notes when the threads were last seen to live.
+async fn watch(server: Arc<Server>) {
+    let mut last = [None; 2];
+    loop {
+        for (thread, last) in server.threads.iter().zip(&mut last) {
+            let now = thread.tick.load(Ordering::Relaxed);
+            if *last != Some(now) {
+                *last = Some(now);
+                let ms = server.daemon.started.elapsed().as_millis() as u64;
+                thread.seen.store(ms, Ordering::Relaxed);
+            }
+        }
+        tokio::time::sleep(LOOK).await;
     }
 }
 
 impl Server {
-    pub(crate) fn new(daemon: Arc<Daemon>, requests: mpsc::Sender<Incoming>) -> Self {
-        Self {
-            daemon,
-            requests,
-            sockets_seen: Arc::default(),
-        }
-    }
-
-    /// Notes when the socket thread was last seen to live.
-    pub(crate) fn watch(&self, tick: Arc<AtomicU64>) -> impl Future<Output = ()> + use<> {
-        let (daemon, seen) = (Arc::clone(&self.daemon), Arc::clone(&self.sockets_seen));
-        async move {
-            let mut last = None;
-            loop {
-                let now = tick.load(Ordering::Relaxed);
-                if last != Some(now) {
-                    last = Some(now);
-                    let ms = daemon.started.elapsed().as_millis() as u64;
-                    seen.store(ms, Ordering::Relaxed);
-                }
-                tokio::time::sleep(Duration::from_secs(1)).await;
-            }
-        }
-    }
-
-    async fn respond(&self, request: Request<HttpBody>) -> Page {
-        let (path, mut page) = self.route(request).await;
+    async fn respond(&self, request: Request<HttpBody>, connection: &Connection) -> Page {
+        let (path, mut page) = self.route(request, connection).await;
         let headers = page.headers_mut();
         for (name, value) in [
             (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
@@ -145,158 +192,237 @@ impl Server {
     }
 
     /// The answer, and the path under which it is counted.
-    async fn route(&self, request: Request<HttpBody>) -> (&'static str, Page) {
+    async fn route(
+        &self,
+        request: Request<HttpBody>,
+        connection: &Connection,
+    ) -> (&'static str, Page) {
         let reads = request.method() == Method::GET || request.method() == Method::HEAD;
         let path = request.uri().path().to_owned();
-        let monitoring = match path.as_str() {
-            "/healthz" => Some(("/healthz", self.health())),
-            "/readyz" => Some(("/readyz", self.readiness())),
-            "/metrics" => Some(("/metrics", self.metrics().await)),
-            _ => None,
-        };
-        if let Some((path, page)) = monitoring {
-            return (path, if reads { page } else { not_allowed("GET") });
+        let monitoring = ["/healthz", "/readyz", "/metrics"];
+        let monitoring = monitoring.into_iter().find(|m| *m == path);
+        let host = self.guard.check_host(request.uri(), request.headers());
+        // Whether the daemon lives and is ready is no secret, and a probe may call it what it
+        // likes.
+        let is_probe = ["/healthz", "/readyz"].contains(&path.as_str());
+        if let Err(why) = &host
+            && !is_probe
+        {
+            return ("refused", text(StatusCode::FORBIDDEN, why));
         }
-        if let Err(why) = self.check_host(request.headers()) {
-            return ("refused", text(StatusCode::FORBIDDEN, &why));
+        let open = monitoring.is_some() && self.guard.open_monitoring;
+        if !open && !self.guard.knows(request.headers()) {
+            return ("refused", self.admit(&request));
+        }
+        if let Some(path) = monitoring {
+            let page = match path {
+                _ if !reads => not_allowed("GET"),
+                "/healthz" => self.health(),
+                "/readyz" => self.readiness(host.is_ok()),
+                _ => self.metrics().await,
+            };
+            return (path, page);
         }
         if path.starts_with("/api/") {
-            return ("/api", self.api(request).await);
+            return ("/api", self.api(request, connection).await);
         }
         let page = match path.as_str() {
             _ if !reads => not_allowed("GET"),
-            "/" => body(StatusCode::OK, "text/html; charset=utf-8", page::live()),
+            "/" => body(StatusCode::OK, "text/html; charset=utf-8", PAGE.clone()),
             "/viewer.css" => body(StatusCode::OK, "text/css; charset=utf-8", page::STYLE),
-            "/viewer.js" => body(
-                StatusCode::OK,
-                "text/javascript; charset=utf-8",
-                page::script(),
-            ),
+            "/viewer.js" => {
+                let kind = "text/javascript; charset=utf-8";
+                body(StatusCode::OK, kind, SCRIPT.clone())
+            }
             _ => return ("unknown", text(StatusCode::NOT_FOUND, "no such page")),
         };
         ("/", page)
     }
 
+    /// Turns the token of an address into a cookie, or asks for it.
+    fn admit(&self, request: &Request<HttpBody>) -> Page {
+        let query = request.uri().query().unwrap_or_default();
+        let mut query = form_urlencoded::parse(query.as_bytes());
+        let shown = query.find(|(name, _)| name == "token");
+        let opens = request.method() == Method::GET && request.uri().path() == "/";
+        let cookie = shown.as_ref().filter(|_| opens);
+        if let Some(cookie) = cookie.and_then(|(_, token)| self.guard.cookie(token)) {
+            let mut page = body(StatusCode::OK, "text/html; charset=utf-8", AGAIN);
+            page.headers_mut().insert(header::SET_COOKIE, cookie);
+            return page;
+        }
+        let why = match shown {
+            Some(_) if opens => "this is not the token that the daemon asks for",
+            _ => {
+                "the daemon asks for a token: open /?token=TOKEN in a browser, or send the header \
+                 Authorization: Bearer TOKEN; whoever runs the daemon finds it in http.token_file, by default \
+                 http.token in the folder of the library"
+            }
+        };
+        let mut page = text(StatusCode::UNAUTHORIZED, why);
+        let scheme = HeaderValue::from_static("Bearer realm=\"coseg\"");
+        page.headers_mut().insert(header::WWW_AUTHENTICATE, scheme);
+        page
+    }
+
     fn health(&self) -> Page {
-        let seen = Duration::from_millis(self.sockets_seen.load(Ordering::Relaxed));
-        let silent = self.daemon.started.elapsed().saturating_sub(seen);
-        if silent > SOCKETS_HANG {
-            let why = format!("the socket thread hangs since {} s", silent.as_secs());
-            return text(StatusCode::SERVICE_UNAVAILABLE, &why);
+        for thread in &self.threads {
+            let seen = Duration::from_millis(thread.seen.load(Ordering::Relaxed));
+            let silent = self.daemon.started.elapsed().saturating_sub(seen);
+            if silent > HANG {
+                let why = format!("{} hangs since {} s", thread.name, silent.as_secs());
+                return text(StatusCode::SERVICE_UNAVAILABLE, &why);
+            }
         }
         text(StatusCode::OK, "alive")
     }
 
-    fn readiness(&self) -> Page {
+    /// Whether changes are taken; why not is for those who know whom they ask.
+    fn readiness(&self, in_words: bool) -> Page {
         match reads::not_ready(&self.daemon) {
             None => text(StatusCode::OK, "ready"),
-            Some(why) => text(StatusCode::SERVICE_UNAVAILABLE, &why),
+            Some(why) if in_words => text(StatusCode::SERVICE_UNAVAILABLE, &why),
+            Some(_) => text(StatusCode::SERVICE_UNAVAILABLE, "not ready"),
         }
     }
 
+    /// One at a time reads them, and the others take what it read.
     async fn metrics(&self) -> Page {
         let kind = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-        match blocking(&self.daemon, |d| reads::metrics(d)).await {
+        let mut kept = Arc::clone(&self.metrics).lock_owned().await;
+        let daemon = Arc::clone(&self.daemon);
+        let read = hands::beside(move || {
+            if let Some((read, text)) = &*kept
+                && read.elapsed() < METRICS_AGE
+            {
+                return Ok(text.clone());
+            }
+            let text = Bytes::from(reads::metrics(&daemon)?);
+            *kept = Some((Instant::now(), text.clone()));
+            Ok::<_, crate::library::LibraryError>(text)
+        });
+        match read.await {
             Ok(Ok(metrics)) => body(StatusCode::OK, kind, metrics),
             Ok(Err(e)) => text(StatusCode::INTERNAL_SERVER_ERROR, &e.to_string()),
-            Err(panic) => text(StatusCode::INTERNAL_SERVER_ERROR, &panic),
+            Err(e) => text(StatusCode::INTERNAL_SERVER_ERROR, &e.message),
         }
     }
 
-    /// A name that somebody made to point to this machine is not its own.
-    fn check_host(&self, headers: &HeaderMap) -> Result<(), String> {
-        let local = self.daemon.http.is_none_or(|a| a.ip().is_loopback());
-        let host = headers.get(header::HOST).and_then(|h| h.to_str().ok());
-        if !local || host.is_some_and(is_loopback) {
-            return Ok(());
-        }
-        Err(format!(
-            "the host {:?} is not this machine's loopback",
-            host.unwrap_or_default()
-        ))
-    }
-
-    /// Whether a change may be asked for at all: by the page itself, where changes are allowed.
-    fn check_change(&self, headers: &HeaderMap) -> Result<(), String> {
+    /// Refuses a change where none are allowed.
+    fn check_edit(&self) -> Result<(), String> {
         if !self.daemon.config().http.edit {
             return Err("http.edit is false: this viewer only shows".to_owned());
         }
-        if self.daemon.has_keys {
+        if self.daemon.has_keys() {
             return Err(
                 "security.keys is set, and HTTP cannot tell who asks: this viewer only shows"
                     .to_owned(),
             );
         }
-        let value = |name: &str| headers.get(name).and_then(|v| v.to_str().ok());
-        if value(GUARD) != Some("1") {
-            return Err(format!("a change needs the header {GUARD}: 1"));
-        }
-        // A browser sends where the page came from; other programs need not.
-        let own = value("host").map(|host| format!("//{host}"));
-        let origin = value("origin").and_then(|o| o.split_once(':'));
-        match origin {
-            Some((_, rest)) if Some(rest) != own.as_deref() => {
-                Err("a change must come from the page itself".to_owned())
-            }
-            _ => Ok(()),
-        }
+        Ok(())
     }
 
-    async fn api(&self, request: Request<HttpBody>) -> Page {
+    async fn api(&self, request: Request<HttpBody>, connection: &Connection) -> Page {
         let (head, sent) = request.into_parts();
-        let query = head.uri.query().unwrap_or_default().to_owned();
-        let query: Vec<(String, String)> = form_urlencoded::parse(query.as_bytes())
-            .into_owned()
-            .collect();
+        let changes = match head.method {
+            Method::GET => false,
+            Method::POST => true,
+            _ => return not_allowed("GET, POST"),
+        };
+        let checked = guard::check_site(&head.headers);
+        let checked = checked.and_then(|()| match changes {
+            true => self
+                .check_edit()
+                .and_then(|()| guard::check_change(&head.headers)),
+            false => Ok(()),
+        });
+        if let Err(why) = checked {
+            let code = ErrorCode::PermissionDenied;
+            return failed(&convert::error(code, ErrorReason::Unspecified, why));
+        }
         let path = head.uri.path().trim_start_matches("/api/").to_owned();
-        let answer = if head.method == Method::GET {
-            api::read(self, &path, &query).await
-        } else if head.method == Method::POST {
-            if let Err(why) = self.check_change(&head.headers) {
-                return failed(&convert::error(
-                    ErrorCode::PermissionDenied,
-                    ErrorReason::Unspecified,
-                    why,
-                ));
+        let answer = if changes {
+            connection.waits();
+            let sent = self.collect(sent).await;
+            connection.works();
+            match sent {
+                Ok(sent) => match self.hands.change().await {
+                    Ok(_turn) => api::change(self, &path, sent).await,
+                    Err(e) => Err(e),
+                },
+                Err(page) => return page,
             }
-            let Some(_memory) = self.daemon.request_memory.try_reserve(MAX_BODY as u64) else {
-                return failed(&busy("requests in hand leave no memory for another change"));
-            };
-            let collected = Limited::new(sent, MAX_BODY).collect();
-            let sent = match tokio::time::timeout(BODY_TIME, collected).await {
-                Ok(Ok(sent)) => sent.to_bytes(),
-                Ok(Err(e)) => {
-                    return text(
-                        StatusCode::PAYLOAD_TOO_LARGE,
-                        &format!("the body cannot be read, its limit is {MAX_BODY} bytes: {e}"),
-                    );
-                }
-                Err(_) => return text(StatusCode::REQUEST_TIMEOUT, "the body did not arrive"),
-            };
-            api::change(self, &path, &sent).await
         } else {
-            return not_allowed("GET, POST");
+            let query = head.uri.query().unwrap_or_default();
+            let query: Vec<(String, String)> = form_urlencoded::parse(query.as_bytes())
+                .into_owned()
+                .collect();
+            match self.hands.read().await {
+                Ok(_turn) => api::read(self, &path, &query).await,
+                Err(e) => Err(e),
+            }
         };
         match answer {
-            Ok(api::Found::Json(value)) => {
-                body(StatusCode::OK, "application/json", value.to_string())
-            }
-            Ok(api::Found::Pack(bytes)) => body(StatusCode::OK, "application/octet-stream", bytes),
+            Ok(found) => body(StatusCode::OK, found.kind, found.bytes),
             Err(e) => failed(&e),
         }
     }
 
-    /// Asks what a client of the sockets could ask, on the same way: the same order, limits and counters.
-    async fn ask(&self, body: Body, frames: Vec<Bytes>) -> Answer {
-        let n_bytes: u64 = frames.iter().map(|f| f.len() as u64).sum();
-        let Some(memory) = self.daemon.request_memory.try_reserve(n_bytes) else {
-            return Err(busy("requests in hand leave no memory for this one"));
+    /// The body of a request. Memory is set aside for what has come, not for what is announced.
+    async fn collect(&self, mut sent: HttpBody) -> Result<hands::Kept<Vec<u8>>, Page> {
+        let too_large = |found: u64| {
+            let why = format!("the body has {found} bytes or more, the limit is {MAX_BODY}");
+            text(StatusCode::PAYLOAD_TOO_LARGE, &why)
         };
+        let announced = sent.size_hint().lower();
+        if announced > MAX_BODY {
+            return Err(too_large(announced));
+        }
+        let collected = async {
+            let full = || failed(&hands::full());
+            let mut memory = self.hands.memory(0).ok_or_else(full)?;
+            let mut bytes = Vec::new();
+            while let Some(frame) = sent.frame().await {
+                let frame = frame.map_err(|e| {
+                    text(
+                        StatusCode::BAD_REQUEST,
+                        &format!("the body cannot be read: {e}"),
+                    )
+                })?;
+                // Trailers are nothing to the daemon.
+                let Ok(data) = frame.into_data() else {
+                    continue;
+                };
+                let found = (bytes.len() + data.len()) as u64;
+                if found > MAX_BODY {
+                    return Err(too_large(found));
+                }
+                if !memory.try_grow(data.len() as u64 * PER_BODY_BYTE) {
+                    return Err(full());
+                }
+                bytes.extend_from_slice(&data);
+            }
+            Ok(hands::Kept { it: bytes, memory })
+        };
+        tokio::time::timeout(PEER_TIME, collected)
+            .await
+            .unwrap_or_else(|_| {
+                let why = format!("the body did not arrive within {} s", PEER_TIME.as_secs());
+                Err(text(StatusCode::REQUEST_TIMEOUT, &why))
+            })
+    }
+
+    /// Asks what a client of the sockets could ask, on the same way: the same order, limits and
+    /// counters. The memory of frames goes with them.
+    async fn ask(&self, body: Body, frames: Option<hands::Kept<Vec<Bytes>>>) -> Answer {
+        let (frames, memory) = frames.map_or((Vec::new(), None), |f| (f.it, Some(f.memory)));
+        let n_bytes: u64 = frames.iter().map(|f| f.len() as u64).sum();
         let ticket = self.daemon.quotas.admit(&CLIENT, n_bytes);
         let ticket = ticket.map_err(|text| busy(&text))?;
         let (sender, receiver) = oneshot::channel();
         let incoming = Incoming {
             reply_to: ReplyTo::Task(sender),
+            user: None,
             request: WireRequest {
                 deadline_ms: ANSWER_MS,
                 body: Some(body),
@@ -304,7 +430,7 @@ impl Server {
             },
             frames,
             received: Instant::now(),
-            memory: Some(memory),
+            memory,
             ticket,
         };
         if self.requests.try_send(incoming).is_err() {
@@ -319,16 +445,6 @@ impl Server {
             ))
         })
     }
-}
-
-/// Whether the host of a request, with or without a port, is a loopback address or `localhost`.
-fn is_loopback(host: &str) -> bool {
-    let name = match host.strip_prefix('[') {
-        Some(v6) => v6.split(']').next().unwrap_or_default(),
-        None => host.split(':').next().unwrap_or_default(),
-    };
-    name.eq_ignore_ascii_case("localhost")
-        || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 fn body(status: StatusCode, kind: &'static str, bytes: impl Into<Bytes>) -> Page {
@@ -375,33 +491,4 @@ fn unexpected(result: &reply::Result) -> wire::Error {
         ErrorReason::Unspecified,
         format!("an unexpected reply: {result:?}"),
     )
-}
-
-#[cfg(test)]
-mod tests {
-    use super::is_loopback;
-
-    #[test]
-    fn only_names_of_loopback_are_this_machine() {
-        for host in [
-            "localhost",
-            "LocalHost:80",
-            "127.0.0.1:8640",
-            "127.1.2.3",
-            "[::1]:80",
-            "[::1]",
-        ] {
-            assert!(is_loopback(host), "{host}");
-        }
-        for host in [
-            "",
-            "example.org",
-            "localhost.example.org",
-            "10.0.0.1:80",
-            "[::2]",
-            "127.0.0.1.x",
-        ] {
-            assert!(!is_loopback(host), "{host}");
-        }
-    }
 }

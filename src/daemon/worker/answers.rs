@@ -13,8 +13,6 @@ use bytes::Bytes;
 
 /// Neighbours when the request does not say how many.
 const DEFAULT_NEIGHBORS: u32 = 5;
-/// Shapes of one GetPortraits.
-const MAX_PORTRAITS: usize = 256;
 
 /// The collection that such a request is about, and the shapes it names.
 pub(crate) fn subjects(body: &Body) -> (&str, Vec<&str>) {
@@ -37,7 +35,8 @@ pub(crate) fn subjects(body: &Body) -> (&str, Vec<&str>) {
 /// Answers a request that came with these raw frames.
 pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes]) -> Answer {
     let mut frames = FrameWriter::default();
-    let key = writes::key(request);
+    // The daemon has put its owner into the name of the client.
+    let key = writes::key(request, None);
     let key = key.as_ref();
     let Some(body) = &request.body else {
         let text = "the request has no body";
@@ -145,15 +144,6 @@ fn portraits(
     r: &wire::GetPortraitsRequest,
     frames: &mut FrameWriter,
 ) -> Result<wire::GetPortraitsReply, wire::Error> {
-    let found = r.shapes.len();
-    if found > MAX_PORTRAITS {
-        let text = format!("{found} shapes are asked for, the limit is {MAX_PORTRAITS}");
-        return Err(convert::field_error(
-            ErrorReason::FieldRange,
-            "shapes",
-            text,
-        ));
-    }
     let mut pack = Pack::default();
     let mut shapes = Vec::new();
     for name in &r.shapes {

@@ -1,6 +1,7 @@
 //! Wire messages become domain values and back; no other module knows both.
 
 mod analysis;
+mod checked;
 mod collections;
 mod corrections;
 mod errors;
@@ -12,6 +13,7 @@ pub use analysis::{
     agreement, descriptors, functional_map, hks, nearest, part_correspondence, point_maps,
     point_request, polygon_values, spectrum, transferred,
 };
+pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
 pub use collections::{collection, collection_differs, collection_spec, label_info};
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{

@@ -9,13 +9,26 @@ const BUDGET_MS = 150;
 const PATIENCE_MS = 500;
 const $ = (id) => document.getElementById(id);
 
+/** Characters that show nothing of themselves or turn the direction of others, as src/library/names.rs has them. */
+const HIDDEN =
+  /[\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\u3164\ufeff\uffa0\ufff0-\ufffb\u{1d173}-\u{1d17a}\u{e0000}-\u{e007f}]/gu;
+/** Letters that look like Latin ones. */
+const LOOKALIKES = /[АВЕКМНОРСТУХаеорсухіІјЈѕЅһԁԛԜԝҮүӀӏΑΒΕΖΗΙΚΜΝΟΡΤΥΧοναινυρ]/gu;
+/** Text with names in it for people: those characters, and such letters beside Latin ones, are written as numbers. */
+function shown(text) {
+  const number = (c) => `\\u{${c.codePointAt(0).toString(16)}}`;
+  const mixed = (word) => (/[A-Za-z]/.test(word) ? word.replace(LOOKALIKES, number) : word);
+  return text.replace(/\p{L}+/gu, mixed).replace(HIDDEN, number);
+}
+
 /** An element with properties, attributes (`aria-…`, `data-…`, `role`) and children; strings become text. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(properties))
     if (key.includes("-") || key === "role") element.setAttribute(key, value);
     else element[key] = value;
-  element.append(...children.filter((c) => c !== null && c !== undefined));
+  const there = children.filter((c) => c !== null && c !== undefined);
+  element.append(...there.map((c) => (typeof c === "string" ? shown(c) : c)));
   return element;
 }
 
@@ -139,7 +152,7 @@ class Gallery {
 
   describe(card, shape) {
     const [name, mark] = card.querySelectorAll(".foot span");
-    name.textContent = shape.name;
+    name.textContent = shown(shape.name);
     card.title = `${shape.name}: ${shape.n_polygons} faces, ${shape.parts.length} parts`;
     const doubt = certainty(shape) < 0.6;
     mark.textContent = shape.stale ? "waiting" : doubt ? "unsure" : "";

@@ -1,7 +1,7 @@
 //! Keys: who is on the list gets in, and may do what the role says; nobody else gets anywhere.
 
 use super::create;
-use crate::harness::{Daemon, Home, add, coseg, refusal, skittle};
+use crate::harness::{Daemon, Home, add, additions, coseg, refusal, skittle, wait_idle};
 use coseg::call;
 use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
@@ -16,6 +16,10 @@ const SERVED: Duration = Duration::from_secs(60);
 
 /// A daemon on every address of this machine, its folder of keys made by the commands.
 fn secured(home: &Home) -> (Daemon, String) {
+    secured_with(home, &[])
+}
+
+fn secured_with(home: &Home, env: &[(&str, &str)]) -> (Daemon, String) {
     let keys = home.path("keys").display().to_string();
     let keys_command = |args: &[&str]| {
         let out = coseg().args(["keys", "--dir", &keys]).args(args).output();
@@ -37,7 +41,7 @@ fn secured(home: &Home) -> (Daemon, String) {
     }
     let listed = keys_command(&["list"]);
     assert_eq!(listed.lines().count(), 4, "{listed}");
-    let mut daemon = home.start_with(&["--endpoint", "tcp://0.0.0.0:*", "--keys", &keys], &[]);
+    let mut daemon = home.start_with(&["--endpoint", "tcp://0.0.0.0:*", "--keys", &keys], env);
     let line = daemon.await_line("serving");
     let bound = line.split("endpoint=").nth(1).unwrap();
     let port = bound.split(' ').next().unwrap().rsplit(':').next().unwrap();
@@ -169,6 +173,121 @@ fn a_revoked_key_is_refused_at_once_on_both_sockets() {
     while next(&stays, 0) {}
     assert!(next(&stays, 30_000), "others connect again by themselves");
     boss.hello().unwrap();
+}
+
+#[test]
+fn what_waits_ends_when_its_key_is_revoked() {
+    let home = Home::new();
+    let keys_dir = home.path("keys").display().to_string();
+    let (_daemon, endpoint) = secured_with(&home, &[("COSEG_TEST_POISON", "1")]);
+    let connect =
+        |name: &str| Client::connect_with(&endpoint, SERVED, Some(keys(&home, name))).unwrap();
+    let mut boss = connect("boss");
+    create(&mut boss, "c");
+    // One that never ends keeps all behind it waiting.
+    let endless = skittle(0).replacen("OFF\n", "OFF # poison: loop\n", 1);
+    let (request, frames) = additions("c", &[("endless", &endless)], wire::AddMode::Job);
+    let job = call!(boss, AddShapes(request), frames, with_frames)
+        .unwrap()
+        .0
+        .job_id;
+    let wait_ms = 30_000;
+    let collection = "c".to_owned();
+    let idle = Body::WaitIdle(wire::WaitIdleRequest {
+        collection,
+        wait_ms,
+    });
+    let (add, frames) = additions("c", &[("b", &skittle(1))], wire::AddMode::Wait);
+    let waits = [(idle, Vec::new()), (Body::AddShapes(add), frames)];
+    let mut waiting = Vec::new();
+    for (body, frames) in waits {
+        let mut feeder = connect("feeder");
+        feeder.hello().unwrap();
+        waiting.push(std::thread::spawn(move || feeder.call(body, frames)));
+    }
+    let mut feeder = connect("feeder");
+    feeder.hello().unwrap();
+    waiting.push(std::thread::spawn(move || {
+        let mut revision = 0;
+        loop {
+            let watching = wire::WatchJobRequest {
+                job_id: job,
+                revision,
+                wait_ms,
+            };
+            let watched = feeder.call(Body::WatchJob(watching), Vec::new())?.0;
+            let wire::reply::Result::WatchJob(watched) = watched else {
+                panic!("{watched:?}");
+            };
+            revision = watched.job.unwrap().revision;
+        }
+    }));
+    // The last one waits when its shape is in the queue.
+    let begin = Instant::now();
+    loop {
+        let jobs = call!(boss, ListJobs(wire::ListJobsRequest::default())).unwrap();
+        if jobs.jobs.len() == 2 {
+            break;
+        }
+        assert!(begin.elapsed() < SERVED, "the shape is not taken in");
+    }
+    let revoked = coseg()
+        .args(["keys", "--dir", &keys_dir, "revoke", "feeder"])
+        .output();
+    assert!(revoked.unwrap().status.success());
+    let begin = Instant::now();
+    for waiting in waiting {
+        match waiting.join().unwrap() {
+            Err(ClientError::Refused(e)) => {
+                assert_eq!(e.reason(), ErrorReason::KeyNotAllowed, "{}", e.message);
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    let took = begin.elapsed();
+    assert!(took < Duration::from_secs(10), "{took:?}");
+}
+
+#[test]
+fn a_client_id_belongs_to_the_key_that_uses_it() {
+    let home = Home::new();
+    let (_daemon, endpoint) = secured(&home);
+    let connect = |name: &str| {
+        let mut client = Client::connect_with(&endpoint, SERVED, Some(keys(&home, name))).unwrap();
+        client.set_client_id("pipeline");
+        client
+    };
+    let (mut boss, mut feeder) = (connect("boss"), connect("feeder"));
+    create(&mut boss, "c");
+    let job = |client: &mut Client, name: &str, id: &str| {
+        let (request, frames) = additions("c", &[(name, &skittle(0))], wire::AddMode::Job);
+        match client
+            .call_as(id, Body::AddShapes(request), frames)
+            .unwrap()
+            .0
+        {
+            wire::reply::Result::AddShapes(reply) => reply.job_id,
+            other => panic!("{other:?}"),
+        }
+    };
+    let first = job(&mut boss, "a", "1");
+    assert_eq!(job(&mut boss, "a", "1"), first);
+    // The same request of another key is another request, and so is another one.
+    let second = job(&mut feeder, "a", "1");
+    assert_ne!(second, first);
+    assert_eq!(job(&mut feeder, "a", "1"), second);
+    job(&mut feeder, "b", "2");
+    job(&mut boss, "c", "2");
+    // A change that is carried out elsewhere, too.
+    wait_idle(&mut boss, "c");
+    let remove = |client: &mut Client, shape: &str| {
+        let (collection, shape) = ("c".to_owned(), shape.to_owned());
+        let removing = Body::RemoveShape(wire::RemoveShapeRequest { collection, shape });
+        client.call_as("3", removing, Vec::new())
+    };
+    remove(&mut boss, "b").unwrap();
+    remove(&mut boss, "b").unwrap();
+    remove(&mut feeder, "c").unwrap();
 }
 
 #[test]
