@@ -13,11 +13,13 @@ mod http;
 mod intake;
 mod memory;
 mod metrics;
+mod outbox;
 mod placing;
 mod progress;
 mod publish;
 mod quota;
 mod reads;
+mod replies;
 mod requests;
 mod service;
 mod sockets;
@@ -36,10 +38,11 @@ use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use metrics::Metrics;
+use outbox::Outbox;
 use progress::Waiting;
 use publish::Notice;
 use quota::Quotas;
-use sockets::Outbox;
+use replies::Replies;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -125,6 +128,10 @@ struct Daemon {
     /// Where the viewer is served, if it is.
     http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
+    /// Replies that are not sent yet.
+    replies: Arc<Replies>,
+    /// Bytes of messages that arrive.
+    arriving: Arc<AtomicU64>,
     quotas: Arc<Quotas>,
     /// Whether connections are authenticated.
     has_keys: bool,
@@ -205,7 +212,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         return Err(StartError::NoCurve);
     }
     let access = access::Access::new(&config.security.keys)?;
-    let bound = sockets::bind(&endpoint, &config.limits, access)?;
+    let replies = Replies::new(config.limits.reply_bytes());
+    let bound = sockets::bind(&endpoint, &config.limits, access, Arc::clone(&replies))?;
     let address = config.http.address()?;
     let listener = address.map(http::bind).transpose()?;
     let directory = config.library()?;
@@ -240,6 +248,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         metrics: Arc::new(Metrics::new()),
         http: listener.as_ref().and_then(|l| l.local_addr().ok()),
         request_memory: Budget::new(config.limits.request_bytes()),
+        replies,
+        arriving: Arc::default(),
         quotas: Quotas::new(&config.limits),
         has_keys: config.has_keys(),
         describe_memory: Budget::new(config.limits.describe_bytes()),
@@ -289,6 +299,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     drop(guard);
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
+        replies: Arc::clone(&daemon.replies),
+        arriving: Arc::clone(&daemon.arriving),
         quotas: Arc::clone(&daemon.quotas),
         counters: Arc::clone(&daemon.counters),
         metrics: Arc::clone(&daemon.metrics),
@@ -382,6 +394,7 @@ impl Running {
         self.daemon
             .request_memory
             .set_limit(config.limits.request_bytes());
+        self.daemon.replies.set_limit(config.limits.reply_bytes());
         self.daemon.quotas.set_limits(&config.limits);
         self.daemon.outbox.reload();
         self.daemon

@@ -3,6 +3,7 @@
 mod adding;
 mod answering;
 mod correcting;
+mod flood;
 mod isolation;
 mod life;
 mod overload;
