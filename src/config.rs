@@ -24,6 +24,8 @@ const ENV_SEPARATOR: &str = "__";
 /// with its spectrum.
 const DESCRIBE_BASE: u64 = 64 << 20;
 const DESCRIBE_PER_BYTE: u64 = 12;
+/// Bytes that frames of a message take beside what is in them.
+const ARRIVING_BASE: u64 = 8 << 20;
 /// Memory below which no shape could be described.
 const MIN_MEMORY: u64 = 256 << 20;
 
@@ -381,6 +383,16 @@ impl Limits {
     /// Bytes set aside for requests that have arrived.
     pub fn request_bytes(&self) -> u64 {
         self.memory.0 / 4
+    }
+
+    /// Bytes set aside for messages that arrive, before they are looked at: at least one of the largest.
+    pub fn arriving_bytes(&self) -> u64 {
+        (self.memory.0 / 8).max(self.max_message.0 + ARRIVING_BASE)
+    }
+
+    /// Bytes set aside for replies that are not sent yet: at least one of the largest.
+    pub fn reply_bytes(&self) -> u64 {
+        (self.memory.0 / 8).max(self.max_message.0)
     }
 
     /// Bytes set aside for shapes being described.

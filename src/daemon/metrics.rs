@@ -62,8 +62,8 @@ pub(crate) struct Now {
     pub(crate) n_jobs: (usize, usize),
     pub(crate) at_stages: BTreeMap<String, usize>,
     pub(crate) memory_limit: u64,
-    /// Bytes reserved for requests, and for shapes being described.
-    pub(crate) memory_reserved: (u64, u64),
+    /// Bytes that are reserved, and what for.
+    pub(crate) memory_reserved: [(&'static str, u64); 4],
     pub(crate) resident_bytes: u64,
     pub(crate) workers: usize,
     pub(crate) uptime_secs: f64,
@@ -364,8 +364,7 @@ impl Metrics {
         g.stored.set(gauge(l.stored_bytes));
         g.catalog.set(gauge(l.catalog_bytes));
         g.memory_limit.set(gauge(now.memory_limit));
-        let (requests, describing) = now.memory_reserved;
-        for (state, n) in [("requests", requests), ("describing", describing)] {
+        for (state, n) in now.memory_reserved {
             g.reserved.get_or_create(&State { state }).set(gauge(n));
         }
         g.resident.set(gauge(now.resident_bytes));

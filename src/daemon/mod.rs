@@ -14,11 +14,13 @@ mod http;
 mod intake;
 mod memory;
 mod metrics;
+mod outbox;
 mod placing;
 mod progress;
 mod publish;
 mod quota;
 mod reads;
+mod replies;
 mod requests;
 mod service;
 mod sockets;
@@ -39,10 +41,11 @@ use crate::library::LibraryError;
 use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use metrics::Metrics;
+use outbox::Outbox;
 use progress::Waiting;
 use publish::Notice;
 use quota::Quotas;
-use sockets::Outbox;
+use replies::Replies;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -130,6 +133,10 @@ struct Daemon {
     /// Where the viewer is served, if it is.
     http: Option<std::net::SocketAddr>,
     request_memory: Arc<Budget>,
+    /// Replies that are not sent yet.
+    replies: Arc<Replies>,
+    /// Bytes of messages that arrive.
+    arriving: Arc<AtomicU64>,
     quotas: Arc<Quotas>,
     /// Who may connect, as it stands, if connections are authenticated.
     allowed: Option<watch::Receiver<Arc<AllowList>>>,
@@ -218,7 +225,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     }
     let access = access::Access::new(&config.security.keys)?;
     let allowed = access.allowed();
-    let bound = sockets::bind(&endpoint, &config.limits, access)?;
+    let replies = Replies::new(config.limits.reply_bytes());
+    let bound = sockets::bind(&endpoint, &config.limits, access, Arc::clone(&replies))?;
     let directory = config.library()?;
     let opened = |source| StartError::Library {
         path: directory.display().to_string(),
@@ -252,6 +260,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         metrics: Arc::new(Metrics::new()),
         http: pages.as_ref().and_then(http::Bound::address),
         request_memory: Budget::new(config.limits.request_bytes()),
+        replies,
+        arriving: Arc::default(),
         quotas: Quotas::new(&config.limits),
         allowed,
         describe_memory: Budget::new(config.limits.describe_bytes()),
@@ -300,6 +310,8 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let pages = pages.map(serve).transpose()?;
     let shared = sockets::Shared {
         memory: Arc::clone(&daemon.request_memory),
+        replies: Arc::clone(&daemon.replies),
+        arriving: Arc::clone(&daemon.arriving),
         quotas: Arc::clone(&daemon.quotas),
         counters: Arc::clone(&daemon.counters),
         metrics: Arc::clone(&daemon.metrics),
@@ -394,6 +406,7 @@ impl Running {
         self.daemon
             .request_memory
             .set_limit(config.limits.request_bytes());
+        self.daemon.replies.set_limit(config.limits.reply_bytes());
         self.daemon.quotas.set_limits(&config.limits);
         self.daemon.outbox.reload();
         self.daemon

@@ -274,7 +274,7 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
         n_refused: count(&daemon.counters.refused),
         n_failed: count(&daemon.counters.failed),
         memory_limit_bytes: config.limits.memory.0,
-        memory_reserved_bytes: daemon.request_memory.used() + daemon.describe_memory.used(),
+        memory_reserved_bytes: memory_reserved(daemon).iter().map(|(_, n)| n).sum(),
         resident_bytes: resident_bytes(),
         workers: daemon.n_workers as u32,
         n_placed: daemon.metrics.n_placed(),
@@ -285,6 +285,16 @@ fn stats(daemon: &Daemon) -> Result<wire::StatsReply, LibraryError> {
         sent_bytes: daemon.metrics.sent_bytes.get(),
         stages: daemon.metrics.stages(&daemon.work.progress().n_at_stages()),
     })
+}
+
+/// What memory is reserved for, and how much.
+fn memory_reserved(daemon: &Daemon) -> [(&'static str, u64); 4] {
+    [
+        ("requests", daemon.request_memory.used()),
+        ("arriving", daemon.arriving.load(Ordering::Relaxed)),
+        ("replies", daemon.replies.used()),
+        ("describing", daemon.describe_memory.used()),
+    ]
 }
 
 /// All that is measured, as text for Prometheus.
@@ -304,7 +314,7 @@ pub(crate) fn metrics(daemon: &Daemon) -> Result<String, LibraryError> {
         n_jobs,
         at_stages,
         memory_limit: daemon.config().limits.memory.0,
-        memory_reserved: (daemon.request_memory.used(), daemon.describe_memory.used()),
+        memory_reserved: memory_reserved(daemon),
         resident_bytes: resident_bytes(),
         workers: daemon.n_workers,
         uptime_secs: daemon.started.elapsed().as_secs_f64(),

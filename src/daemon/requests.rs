@@ -143,10 +143,18 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
-                let turn = readers.queue(&client);
-                let computing = Arc::clone(&computing);
+                // Who has much unread keeps no place from others until it has read.
+                let asks = in_hand.incoming.reply_to.client().cloned();
+                let asks = asks.filter(|client| !daemon.replies.has_room(client));
+                let turn = asks.is_none().then(|| readers.queue(&client));
+                let (readers, computing) = (Arc::clone(&readers), Arc::clone(&computing));
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
+                    if let Some(asks) = asks {
+                        let end = |client| d.outbox.end(client);
+                        d.replies.room(&asks, end).await?;
+                    }
+                    let turn = turn.unwrap_or_else(|| readers.queue(&client));
                     let pass = turn.come().await;
                     let looked = blocking(&d, move |d| reads::look_up(d, body)).await;
                     drop(pass);

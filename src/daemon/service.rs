@@ -54,6 +54,7 @@ pub fn serve(
     if let Err(e) = rustix::process::setrlimit(rustix::process::Resource::Nofile, raised) {
         tracing::warn!(error = %e, "the number of open files stays as it was");
     }
+    zmq_bounds::give_back_freed_memory();
     let stopping = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
         // In this order: the first signal arms the second.

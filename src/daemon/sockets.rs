@@ -5,7 +5,9 @@ use crate::config::Limits;
 use crate::daemon::access::{Access, ZAP_ENDPOINT};
 use crate::daemon::memory::{Budget, Reservation};
 use crate::daemon::metrics::Metrics;
+use crate::daemon::outbox::{Dropped, Outbox, Outgoing, Peer, send_reply};
 use crate::daemon::quota::{Quotas, Ticket};
+use crate::daemon::replies::{Frame, Replies};
 use crate::daemon::requests::Answer;
 use crate::daemon::{Counters, StartError};
 use crate::ipc::convert;
@@ -16,14 +18,18 @@ use bytes::Bytes;
 use prost::Message as _;
 use std::os::unix::fs::PermissionsExt;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
+use zmq_bounds::Bounds;
 
 /// Raw frames of one message; a shape takes at most two.
 pub(crate) const MAX_FRAMES: usize = 1_024;
 /// Bytes of a header frame.
 pub(crate) const MAX_HEADER_BYTES: u64 = 4 << 20;
+/// What a header takes when it is decoded, by its bytes, and a frame beside its bytes.
+const DECODED: u64 = 8;
+const FRAME_COST: u64 = 256;
 /// Characters of the ids of a request.
 pub(crate) const MAX_ID_CHARS: usize = 128;
 /// Routing frames before the raw frames of a received message: identity, perhaps a delimiter, header.
@@ -33,7 +39,14 @@ const PEER_HWM: i32 = 256;
 /// Events that ZeroMQ keeps for one subscriber; beyond, the subscriber loses events and sees the gap.
 const SUBSCRIBER_HWM: i32 = 4_096;
 /// Bytes of a subscription; a topic is a collection's name.
-const MAX_SUBSCRIPTION_BYTES: i64 = 4_096;
+const MAX_SUBSCRIPTION_BYTES: i64 = 1_024;
+/// Subscriptions of one subscriber.
+const MAX_SUBSCRIPTIONS: i32 = 1_024;
+/// Bytes of memory that the subscriptions of all subscribers may take, and of those that are not looked at yet.
+const MAX_SUBSCRIBED: i64 = 32 << 20;
+const MAX_SUBSCRIBING: i64 = 8 << 20;
+/// Descriptors that are set aside for files, workers and pages, and how many more for each worker's process.
+const KEPT_FILES: u64 = 192;
 /// Milliseconds between heartbeats on a connection, and until a silent peer is given up.
 const HEARTBEAT_MS: i32 = 10_000;
 const HEARTBEAT_TIMEOUT_MS: i32 = 30_000;
@@ -54,20 +67,22 @@ pub(crate) const BUSY_RETRY_MS: u64 = 250;
 /// Owner and group may connect; the directory decides who gets that far.
 const SOCKET_MODE: u32 = 0o660;
 
-/// Where a reply goes.
-#[derive(Debug, Clone)]
-pub(crate) struct Peer {
-    identity: Bytes,
-    /// Whether the peer puts an empty frame before the header, as a REQ socket does.
-    delimiter: bool,
-}
-
 /// Who is waiting for a reply.
 pub(crate) enum ReplyTo {
     /// A client of the sockets.
     Peer(Peer),
     /// A task of this process.
     Task(tokio::sync::oneshot::Sender<Answer>),
+}
+
+impl ReplyTo {
+    /// The client of the sockets that waits.
+    pub(crate) fn client(&self) -> Option<&Bytes> {
+        match self {
+            Self::Peer(peer) => Some(&peer.identity),
+            Self::Task(_) => None,
+        }
+    }
 }
 
 /// A request that arrived.
@@ -82,62 +97,6 @@ pub(crate) struct Incoming {
     pub(crate) memory: Option<Reservation>,
     /// Counts it for its client.
     pub(crate) ticket: Ticket,
-}
-
-enum Outgoing {
-    Reply {
-        peer: Peer,
-        reply: Box<Reply>,
-        frames: Vec<Bytes>,
-    },
-    Event {
-        topic: Vec<u8>,
-        body: Vec<u8>,
-    },
-    Reload,
-    Stop,
-}
-
-/// Where the other threads leave what is to be sent.
-pub(crate) struct Outbox {
-    queue: mpsc::Sender<Outgoing>,
-    wake: Mutex<zmq::Socket>,
-}
-
-impl Outbox {
-    pub(crate) fn reply(&self, peer: Peer, reply: Reply, frames: Vec<Bytes>) {
-        self.push(Outgoing::Reply {
-            peer,
-            reply: Box::new(reply),
-            frames,
-        });
-    }
-
-    pub(crate) fn event(&self, topic: Vec<u8>, body: Vec<u8>) {
-        self.push(Outgoing::Event { topic, body });
-    }
-
-    /// Reads the allow list again.
-    pub(crate) fn reload(&self) {
-        self.push(Outgoing::Reload);
-    }
-
-    pub(crate) fn stop(&self) {
-        self.push(Outgoing::Stop);
-    }
-
-    fn push(&self, outgoing: Outgoing) {
-        // The thread is gone: so is whoever waits for this.
-        if self.queue.send(outgoing).is_err() {
-            return;
-        }
-        let wake = self.wake.lock().unwrap_or_else(PoisonError::into_inner);
-        match wake.send(zmq::Message::new(), zmq::DONTWAIT) {
-            // Full: a wake-up is under way already.
-            Ok(()) | Err(zmq::Error::EAGAIN) => {}
-            Err(e) => tracing::error!(error = %e, "the socket thread cannot be woken"),
-        }
-    }
 }
 
 /// Sockets that are bound but not yet served.
@@ -161,6 +120,7 @@ pub(crate) fn bind(
     endpoint: &Endpoint,
     limits: &Limits,
     access: Access,
+    replies: Arc<Replies>,
 ) -> Result<Bound, StartError> {
     endpoint.check_servable(access.has_keys())?;
     let context = zmq::Context::new();
@@ -169,12 +129,19 @@ pub(crate) fn bind(
         source,
     };
     let sockets = || {
-        let router = context.socket(zmq::ROUTER)?;
+        let mut router = context.socket(zmq::ROUTER)?;
         router.set_router_mandatory(true)?;
         router.set_maxmsgsize(i64::try_from(limits.max_message.0).unwrap_or(i64::MAX))?;
         router.set_rcvhwm(PEER_HWM)?;
         router.set_sndhwm(PEER_HWM)?;
         protect(&router, endpoint, &access)?;
+        let bounds = Bounds {
+            max_fd: max_connection(),
+            max_frames: 4 * MAX_FRAMES as i32,
+            max_held: i64::try_from(limits.arriving_bytes()).unwrap_or(i64::MAX),
+            ..Bounds::default()
+        };
+        zmq_bounds::set_bounds(&mut router, &bounds)?;
         let publisher = publisher(&context, endpoint, &access)?;
         // Before any socket is bound, or connections would be let in unasked.
         let zap = context.socket(zmq::REP)?;
@@ -217,11 +184,7 @@ pub(crate) fn bind(
     };
     let endpoint = listen(&router, endpoint)?;
     let events = listen(&publisher, &endpoint.events()?)?;
-    let (sender, queue) = mpsc::channel();
-    let outbox = Arc::new(Outbox {
-        queue: sender,
-        wake: Mutex::new(wake_sender),
-    });
+    let (outbox, queue) = Outbox::new(wake_sender, replies);
     Ok(Bound {
         context,
         zap,
@@ -255,16 +218,27 @@ fn publisher(
     endpoint: &Endpoint,
     access: &Access,
 ) -> zmq::Result<zmq::Socket> {
-    let publisher = context.socket(zmq::PUB)?;
+    let mut publisher = context.socket(zmq::PUB)?;
     publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;
     publisher.set_sndhwm(SUBSCRIBER_HWM)?;
     protect(&publisher, endpoint, access)?;
+    let bounds = Bounds {
+        max_fd: max_connection(),
+        max_frames: 1,
+        max_held: MAX_SUBSCRIBING,
+        max_subscriptions: MAX_SUBSCRIPTIONS,
+        max_subscribed: MAX_SUBSCRIBED,
+    };
+    zmq_bounds::set_bounds(&mut publisher, &bounds)?;
     Ok(publisher)
 }
 
 /// What the socket thread shares with the daemon.
 pub(crate) struct Shared {
     pub(crate) memory: Arc<Budget>,
+    pub(crate) replies: Arc<Replies>,
+    /// Bytes of messages that arrive.
+    pub(crate) arriving: Arc<AtomicU64>,
     pub(crate) quotas: Arc<Quotas>,
     pub(crate) counters: Arc<Counters>,
     pub(crate) metrics: Arc<Metrics>,
@@ -290,6 +264,7 @@ pub(crate) fn serve(
         requests,
         limits,
         must_bind: false,
+        dropped: Dropped::default(),
     };
     std::thread::Builder::new()
         .name("sockets".to_owned())
@@ -303,6 +278,7 @@ struct SocketThread {
     limits: FrameLimits,
     /// The event socket was unbound and is not bound again yet.
     must_bind: bool,
+    dropped: Dropped,
 }
 
 impl SocketThread {
@@ -325,16 +301,14 @@ impl SocketThread {
             if looked.elapsed() >= Duration::from_millis(POLL_MS.unsigned_abs()) {
                 looked = Instant::now();
                 self.reload(false);
+                self.look();
             }
             self.answer_zap();
             while self.bound.wake.recv_msg(zmq::DONTWAIT).is_ok() {}
             while let Ok(outgoing) = self.bound.queue.try_recv() {
                 match outgoing {
-                    Outgoing::Reply {
-                        peer,
-                        reply,
-                        frames,
-                    } => self.reply(&peer, &reply, frames),
+                    Outgoing::Reply { peer, frames } => self.send(&peer, frames),
+                    Outgoing::End(client) => self.end(&client),
                     Outgoing::Event { topic, body } => self.publish(topic, body),
                     Outgoing::Reload => self.reload(true),
                     Outgoing::Stop => return,
@@ -417,10 +391,12 @@ impl SocketThread {
     fn request(&self, user: Option<String>, message: Vec<Bytes>) {
         let received = Instant::now();
         let n_bytes = message.iter().map(|f| f.len() as u64).sum();
+        let n_frames = message.len() as u64;
         self.shared.metrics.received_bytes.inc_by(n_bytes);
         let Some((peer, header, frames)) = split(message) else {
             return;
         };
+        let header_bytes = header.len() as u64;
         let invalid =
             |reason, text: String| convert::error(ErrorCode::InvalidArgument, reason, text);
         if header.len() as u64 > self.limits.max_header_bytes {
@@ -480,7 +456,9 @@ impl SocketThread {
                 return self.busy(&peer, request.request_id, ErrorReason::ClientQuota, text);
             }
         };
-        let Some(memory) = self.shared.memory.try_reserve(n_bytes) else {
+        // A header is decoded, and each frame has an owner.
+        let n_reserved = (n_bytes + DECODED * header_bytes + FRAME_COST * n_frames).min(most);
+        let Some(memory) = self.shared.memory.try_reserve(n_reserved) else {
             let text = format!("requests in hand leave no memory for {n_bytes} bytes more");
             return self.busy(&peer, request.request_id, ErrorReason::MemoryLimit, text);
         };
@@ -514,36 +492,52 @@ impl SocketThread {
             request_id,
             result: Some(reply::Result::Error(error)),
         };
-        self.reply(peer, &reply, Vec::new());
+        self.bound.outbox.reply(peer.clone(), reply, Vec::new());
     }
 
-    fn reply(&self, peer: &Peer, reply: &Reply, frames: Vec<Bytes>) {
+    fn send(&mut self, peer: &Peer, frames: Vec<Frame>) {
         self.shared
             .counters
             .requests
             .fetch_add(1, Ordering::Relaxed);
-        let mut parts = vec![zmq::Message::from(&peer.identity[..])];
-        if peer.delimiter {
-            parts.push(zmq::Message::new());
-        }
-        parts.push(zmq::Message::from(reply.encode_to_vec()));
-        parts.extend(frames.iter().map(|f| zmq::Message::from(&f[..])));
         let metrics = &self.shared.metrics;
         metrics.replies.inc();
-        metrics
-            .sent_bytes
-            .inc_by(parts.iter().map(|p| p.len() as u64).sum());
-        match frames::send(&self.bound.router, parts, zmq::DONTWAIT) {
+        let n_bytes = frames.iter().map(|f| f.as_ref().len() as u64).sum();
+        metrics.sent_bytes.inc_by(n_bytes);
+        match send_reply(&mut self.bound.router, peer, frames) {
             Ok(()) => {}
-            Err(zmq::Error::EHOSTUNREACH) => {
-                tracing::debug!(
-                    request = reply.request_id,
-                    "the client left before its reply"
-                );
+            Err(zmq::Error::EHOSTUNREACH) => tracing::debug!("a client left before its reply"),
+            // As many wait for it as may.
+            Err(zmq::Error::EAGAIN) => {
+                self.shared.replies.ends(&peer.identity);
+                self.end(&peer.identity);
             }
-            // It asks again under the same request id when it reads again.
-            Err(e) => tracing::warn!(request = reply.request_id, error = %e, "a reply was dropped"),
+            Err(e) => tracing::warn!(error = %e, "a reply was dropped"),
         }
+    }
+
+    /// Ends the connection of a client that does not read.
+    fn end(&mut self, client: &Bytes) {
+        match zmq_bounds::drop_peer(&mut self.bound.router, client) {
+            Ok(()) => self.dropped.unread += 1,
+            Err(zmq::Error::EHOSTUNREACH) => {}
+            Err(e) => tracing::error!(error = %e, "a connection cannot be ended"),
+        }
+    }
+
+    /// Looks at what arrives, and says what was dropped.
+    fn look(&mut self) {
+        let bound = &mut self.bound;
+        let sockets = [&mut bound.router, &mut bound.publisher];
+        let [router, publisher] = sockets.map(|socket| {
+            let held = zmq_bounds::held(socket).unwrap_or(0);
+            (held, zmq_bounds::dropped(socket).unwrap_or(0))
+        });
+        let arriving = router.0 + publisher.0;
+        self.shared.arriving.store(arriving, Ordering::Relaxed);
+        self.dropped.excess = router.1;
+        self.dropped.subscriptions = publisher.1;
+        self.dropped.say();
     }
 
     fn publish(&self, topic: Vec<u8>, body: Vec<u8>) {
@@ -553,6 +547,13 @@ impl SocketThread {
             tracing::warn!(error = %e, "an event was not published");
         }
     }
+}
+
+/// The descriptor from which on connections are closed at once, so that some are left for everything else.
+fn max_connection() -> i32 {
+    let files = rustix::process::getrlimit(rustix::process::Resource::Nofile);
+    let files = files.current.unwrap_or(u64::MAX);
+    i32::try_from(files - KEPT_FILES.min(files / 2)).unwrap_or(i32::MAX)
 }
 
 impl Drop for Bound {

@@ -3,6 +3,7 @@
 mod adding;
 mod answering;
 mod correcting;
+mod flood;
 mod http_abuse;
 mod isolation;
 mod life;

@@ -83,13 +83,33 @@ impl Home {
         daemon
     }
 
+    /// The same with so many open files at most.
+    pub(crate) fn start_limited(&self, n_files: u64, args: &[&str]) -> Daemon {
+        let limited = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
+        let binary = coseg();
+        let mut shell = Command::new("sh");
+        shell.arg("-c").arg(limited).arg(binary.get_program());
+        for (name, value) in binary.get_envs() {
+            match value {
+                Some(value) => shell.env(name, value),
+                None => shell.env_remove(name),
+            };
+        }
+        let mut daemon = self.spawn_by(shell, args, &[]);
+        daemon.await_notice("READY=1");
+        daemon
+    }
+
     /// Starts a daemon that may refuse to start.
     pub(crate) fn spawn(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
+        self.spawn_by(coseg(), args, env)
+    }
+
+    fn spawn_by(&self, mut command: Command, args: &[&str], env: &[(&str, &str)]) -> Daemon {
         let notify_path = self.path("notify");
         let _ = std::fs::remove_file(&notify_path);
         let notify = UnixDatagram::bind(&notify_path).unwrap();
         notify.set_read_timeout(Some(DEADLINE)).unwrap();
-        let mut command = coseg();
         command
             .arg("serve")
             .arg("--library")
