@@ -10,6 +10,7 @@ mod access;
 mod asked;
 mod fair;
 mod http;
+mod ingest;
 mod intake;
 mod memory;
 mod metrics;
@@ -21,6 +22,7 @@ mod reads;
 mod requests;
 mod service;
 mod sockets;
+mod sweep;
 mod work;
 mod worker;
 mod writes;
@@ -33,7 +35,6 @@ use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::ipc::keys::KeyError;
 use crate::library::LibraryError;
-use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use metrics::Metrics;
 use progress::Waiting;
@@ -41,7 +42,7 @@ use publish::Notice;
 use quota::Quotas;
 use sockets::Outbox;
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{Semaphore, mpsc, watch};
@@ -51,9 +52,6 @@ use work::Work;
 const ARRIVAL_QUEUE: usize = 256;
 /// How long the runtime is given to answer what was asked before the sockets close.
 const LAST_ANSWERS: Duration = Duration::from_secs(2);
-
-/// Time between sweeps of orphaned files.
-const SWEEP_EVERY: Duration = Duration::from_secs(3_600);
 
 /// Why the daemon did not start.
 #[derive(Debug, thiserror::Error)]
@@ -129,6 +127,10 @@ struct Daemon {
     /// Whether connections are authenticated.
     has_keys: bool,
     describe_memory: Arc<Budget>,
+    /// A permit for each thread that reads a file which a request names by path.
+    reading: Arc<Semaphore>,
+    /// Something was done since the last sweep after which files may be needed no more.
+    freed: AtomicBool,
     /// A permit for each thread that may describe.
     workers: Arc<Semaphore>,
     n_workers: usize,
@@ -154,6 +156,11 @@ impl Daemon {
 
     fn is_draining(&self) -> bool {
         *self.drain.borrow()
+    }
+
+    /// Notes that files may be needed no more.
+    fn freed(&self) {
+        self.freed.store(true, Ordering::Relaxed);
     }
 
     fn notice(&self, notice: Notice) {
@@ -243,6 +250,9 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         quotas: Quotas::new(&config.limits),
         has_keys: config.has_keys(),
         describe_memory: Budget::new(config.limits.describe_bytes()),
+        reading: Arc::new(Semaphore::new(ingest::MAX_THREADS)),
+        // What the last run removed, it may not have swept.
+        freed: AtomicBool::new(true),
         workers: Arc::new(Semaphore::new(n_workers)),
         n_workers,
         pending: Arc::new(Semaphore::new(config.limits.max_requests)),
@@ -278,7 +288,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     daemon.take_up_items(queued);
     tokio::spawn(work::schedule(Arc::clone(&daemon)));
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
-    tokio::spawn(sweep(Arc::clone(&daemon)));
+    tokio::spawn(sweep::run(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
     if let Some(listener) = listener {
         let listener = tokio::net::TcpListener::from_std(listener)?;
@@ -317,28 +327,6 @@ fn instance() -> String {
         std::process::id(),
         STARTS.fetch_add(1, Ordering::Relaxed)
     )
-}
-
-/// Removes files that nothing needs any more, now and then; never at start.
-async fn sweep(daemon: Arc<Daemon>) {
-    loop {
-        tokio::time::sleep(SWEEP_EVERY).await;
-        match blocking(&daemon, |d| d.library.forget_old()).await {
-            Ok(Ok((replies, jobs))) => tracing::debug!(replies, jobs, "forgot what is old"),
-            Ok(Err(e)) => tracing::warn!(error = %e, "old replies and jobs cannot be forgotten"),
-            Err(panic) => tracing::error!(panic, "forgetting old replies panicked"),
-        }
-        let swept = blocking(&daemon, |d| d.library.store().sweep_orphans(ORPHAN_AGE)).await;
-        match swept {
-            Ok(Ok(files)) if files.is_empty() => {}
-            Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
-            Ok(Err(e)) => {
-                daemon.metrics.fault("sweep");
-                tracing::warn!(error = %e, "orphaned files cannot be removed");
-            }
-            Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
-        }
-    }
 }
 
 /// Shows the watchdog that the runtime runs tasks.
@@ -454,6 +442,8 @@ impl Running {
         // Inside, for the timer needs the runtime.
         let ended = runtime.block_on(async { tokio::time::timeout(limit, last_work).await });
         self.daemon.pool.close();
+        // Here, for a thread that hangs keeps the library from being dropped.
+        self.daemon.library.store().catalog().settle();
         if ended.is_err() {
             tracing::warn!("the drain took longer than {} s", limit.as_secs());
         }
