@@ -18,6 +18,7 @@ pub struct Ingest {
 }
 
 /// A shape of a request.
+#[derive(Debug)]
 pub struct ShapeInput {
     /// Its name.
     pub name: String,
@@ -30,6 +31,7 @@ pub struct ShapeInput {
 }
 
 /// Where the bytes of a mesh file are.
+#[derive(Debug)]
 pub enum Source {
     /// Here.
     Bytes(Vec<u8>),
@@ -394,7 +396,18 @@ mod tests {
             ErrorReason::FrameMissing
         );
         let path = |p: &str| Some(Source::Path(p.to_owned()));
-        assert_eq!(reason(path("/a/b.off"), 0), ErrorReason::MeshTooLarge);
+        let shapes = read(path("/a/b.off"), &[]).unwrap();
+        let super::Source::File(file) = &shapes[0].source else {
+            panic!("{shapes:?}");
+        };
+        assert_eq!(file, std::path::Path::new("/a/b.off"));
+        let ingest = Ingest {
+            max_shapes: 1,
+            max_shape_bytes: 1_000,
+        };
+        assert!(ingest.check_length(0, "x", 1_000).is_ok());
+        let error = ingest.check_length(0, "x", 1_001).unwrap_err();
+        assert_eq!(error.reason(), ErrorReason::MeshTooLarge);
         assert_eq!(reason(path("/a/b.step"), 0), ErrorReason::FieldRange);
     }
 }
