@@ -10,7 +10,7 @@ use config::{FileFormat, Source, Value, ValueKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The default settings, commented.
 pub const DEFAULT: &str = include_str!("../config/coseg.toml");
@@ -496,17 +496,6 @@ fn variable_name(key: &str) -> String {
         "{ENV_PREFIX}{ENV_SEPARATOR}{}",
         key.to_uppercase().replace('.', ENV_SEPARATOR)
     )
-}
-
-/// Whether `path` is below one of `roots`, as paths on disk: links are followed first.
-pub fn is_below(path: &Path, roots: &[PathBuf]) -> bool {
-    let Ok(path) = path.canonicalize() else {
-        return false;
-    };
-    roots
-        .iter()
-        .filter_map(|r| r.canonicalize().ok())
-        .any(|root| path.starts_with(root))
 }
 
 #[cfg(test)]

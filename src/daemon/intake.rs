@@ -1,22 +1,23 @@
 //! Shapes are taken in: room in the queue is reserved, files are written side by side, and what is there is accepted in the
 //! order of arrival, together where several wait.
 
-use crate::config;
 use crate::daemon::fair::{Client, Gate, Pass, Turn};
+use crate::daemon::ingest::Files;
 use crate::daemon::progress::Load;
 use crate::daemon::publish::Notice;
 use crate::daemon::requests::panic_error;
 use crate::daemon::writes::{Done, may_change, refuse};
 use crate::daemon::{Daemon, blocking};
-use crate::ipc::convert;
+use crate::ipc::convert::{self, Source};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply};
-use crate::library::{Job, KeptShapes, LibraryError, RequestKey, Submission};
+use crate::library::{
+    Job, KeptShapes, LibraryError, NewShape, RequestKey, Submission, check_shape_name,
+};
 use bytes::Bytes;
-use std::io::Read as _;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 
 /// Milliseconds, at least and at most, after which a queue of shapes that is full is worth another try.
@@ -83,20 +84,45 @@ pub(crate) fn keep(
     frames: &[Bytes],
     mut room: Room,
     key: Option<RequestKey>,
+    deadline: Option<Instant>,
 ) -> Result<Addition, wire::Error> {
     may_change(daemon, key.as_ref())?;
-    let config = daemon.config();
-    let (limits, roots) = (&config.limits, &config.ingest.paths);
-    let max_shape_bytes = limits.shape_bytes();
-    let read_path = |path: &Path| read_allowed(path, roots, max_shape_bytes);
+    let limits = &daemon.config().limits;
     let ingest = convert::Ingest {
         max_shapes: limits.max_shapes_per_request,
-        max_shape_bytes,
-        read_path: &read_path,
+        max_shape_bytes: limits.shape_bytes(),
     };
-    let shapes = convert::new_shapes(&request, FrameReader::new(frames), &ingest)?;
-    room.resize(shapes.iter().map(|s| s.bytes.len() as u64).collect())?;
-    let shapes = daemon.library.keep(shapes).map_err(refuse)?;
+    let inputs = convert::new_shapes(&request, FrameReader::new(frames), &ingest)?;
+    let files = Files::new(daemon, deadline);
+    let mut n_bytes = Vec::with_capacity(inputs.len());
+    for (i, input) in inputs.iter().enumerate() {
+        let length = match &input.source {
+            Source::Bytes(bytes) => bytes.len() as u64,
+            Source::File(path) => files.length(path)?,
+        };
+        ingest.check_length(i, &input.name, length)?;
+        n_bytes.push(length);
+    }
+    room.resize(n_bytes.clone())?;
+    for input in &inputs {
+        check_shape_name(&input.name).map_err(refuse)?;
+    }
+    let mut shapes = KeptShapes::new();
+    // One after the other, so that one file at a time is in memory.
+    for (input, length) in inputs.into_iter().zip(n_bytes) {
+        let bytes = match input.source {
+            Source::Bytes(bytes) => bytes,
+            Source::File(path) => files.read(&path, length)?,
+        };
+        let shape = NewShape {
+            name: input.name,
+            bytes,
+            format: input.format,
+            replace: input.replace,
+        };
+        let library = &daemon.library;
+        library.keep_another(&mut shapes, shape).map_err(refuse)?;
+    }
     Ok(Addition {
         request,
         key,
@@ -351,51 +377,6 @@ fn ensure_collection(
         }
         Err(e) => Err(refuse(e)),
     }
-}
-
-/// The bytes of a file below one of `roots`.
-fn read_allowed(
-    path: &Path,
-    roots: &[std::path::PathBuf],
-    max_bytes: u64,
-) -> Result<Vec<u8>, wire::Error> {
-    let forbidden = || {
-        let text = format!(
-            "{} is not below a directory of ingest.paths",
-            path.display()
-        );
-        convert::error(
-            ErrorCode::PermissionDenied,
-            ErrorReason::PathForbidden,
-            text,
-        )
-    };
-    if !path.is_absolute() || !config::is_below(path, roots) {
-        return Err(forbidden());
-    }
-    let unreadable = |text: String| {
-        convert::error(
-            ErrorCode::InvalidArgument,
-            ErrorReason::PathUnreadable,
-            text,
-        )
-    };
-    let io = |e: std::io::Error| unreadable(format!("{}: {e}", path.display()));
-    let resolved = path.canonicalize().map_err(io)?;
-    // A pipe or a device could block for ever or never end.
-    if !std::fs::metadata(&resolved).map_err(io)?.is_file() {
-        return Err(unreadable(format!(
-            "{} is not a regular file",
-            path.display()
-        )));
-    }
-    let file = std::fs::File::open(&resolved).map_err(io)?;
-    let mut bytes = Vec::new();
-    // One byte more shows that the file is too large.
-    file.take(max_bytes.saturating_add(1))
-        .read_to_end(&mut bytes)
-        .map_err(io)?;
-    Ok(bytes)
 }
 
 #[cfg(test)]

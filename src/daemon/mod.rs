@@ -11,6 +11,7 @@ mod access;
 mod asked;
 mod fair;
 mod http;
+mod ingest;
 mod intake;
 mod memory;
 mod metrics;
@@ -24,6 +25,7 @@ mod replies;
 mod requests;
 mod service;
 mod sockets;
+mod sweep;
 mod waits;
 mod work;
 mod worker;
@@ -38,7 +40,6 @@ use crate::config::{Config, ConfigError};
 use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::ipc::keys::{AllowList, KeyError};
 use crate::library::LibraryError;
-use crate::store::objects::ORPHAN_AGE;
 use memory::Budget;
 use metrics::Metrics;
 use outbox::Outbox;
@@ -47,7 +48,7 @@ use publish::Notice;
 use quota::Quotas;
 use replies::Replies;
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 use tokio::sync::{Semaphore, mpsc, watch};
@@ -57,9 +58,6 @@ use work::Work;
 const ARRIVAL_QUEUE: usize = 256;
 /// How long the runtime is given to answer what was asked before the sockets close.
 const LAST_ANSWERS: Duration = Duration::from_secs(2);
-
-/// Time between sweeps of orphaned files.
-const SWEEP_EVERY: Duration = Duration::from_secs(3_600);
 
 /// Why the daemon did not start.
 #[derive(Debug, thiserror::Error)]
@@ -141,6 +139,10 @@ struct Daemon {
     /// Who may connect, as it stands, if connections are authenticated.
     allowed: Option<watch::Receiver<Arc<AllowList>>>,
     describe_memory: Arc<Budget>,
+    /// A permit for each thread that reads a file which a request names by path.
+    reading: Arc<Semaphore>,
+    /// Something was done since the last sweep after which files may be needed no more.
+    freed: AtomicBool,
     /// A permit for each thread that may describe.
     workers: Arc<Semaphore>,
     n_workers: usize,
@@ -171,6 +173,11 @@ impl Daemon {
 
     fn is_draining(&self) -> bool {
         *self.drain.borrow()
+    }
+
+    /// Notes that files may be needed no more.
+    fn freed(&self) {
+        self.freed.store(true, Ordering::Relaxed);
     }
 
     fn notice(&self, notice: Notice) {
@@ -265,6 +272,9 @@ pub fn start(config: Config) -> Result<Running, StartError> {
         quotas: Quotas::new(&config.limits),
         allowed,
         describe_memory: Budget::new(config.limits.describe_bytes()),
+        reading: Arc::new(Semaphore::new(ingest::MAX_THREADS)),
+        // What the last run removed, it may not have swept.
+        freed: AtomicBool::new(true),
         workers: Arc::new(Semaphore::new(n_workers)),
         n_workers,
         pending: Arc::new(Semaphore::new(config.limits.max_requests)),
@@ -300,7 +310,7 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     daemon.take_up_items(queued);
     tokio::spawn(work::schedule(Arc::clone(&daemon)));
     tokio::spawn(requests::dispatch(Arc::clone(&daemon), requests_out));
-    tokio::spawn(sweep(Arc::clone(&daemon)));
+    tokio::spawn(sweep::run(Arc::clone(&daemon)));
     tokio::spawn(tick(Arc::clone(&runtime_tick)));
     drop(guard);
     let serve = |pages: http::Bound| {
@@ -341,28 +351,6 @@ fn instance() -> String {
         std::process::id(),
         STARTS.fetch_add(1, Ordering::Relaxed)
     )
-}
-
-/// Removes files that nothing needs any more, now and then; never at start.
-async fn sweep(daemon: Arc<Daemon>) {
-    loop {
-        tokio::time::sleep(SWEEP_EVERY).await;
-        match blocking(&daemon, |d| d.library.forget_old()).await {
-            Ok(Ok((replies, jobs))) => tracing::debug!(replies, jobs, "forgot what is old"),
-            Ok(Err(e)) => tracing::warn!(error = %e, "old replies and jobs cannot be forgotten"),
-            Err(panic) => tracing::error!(panic, "forgetting old replies panicked"),
-        }
-        let swept = blocking(&daemon, |d| d.library.store().sweep_orphans(ORPHAN_AGE)).await;
-        match swept {
-            Ok(Ok(files)) if files.is_empty() => {}
-            Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed orphaned files"),
-            Ok(Err(e)) => {
-                daemon.metrics.fault("sweep");
-                tracing::warn!(error = %e, "orphaned files cannot be removed");
-            }
-            Err(panic) => tracing::error!(panic, "removing orphaned files panicked"),
-        }
-    }
 }
 
 /// Shows the watchdog that the runtime runs tasks.
@@ -479,6 +467,8 @@ impl Running {
         // Inside, for the timer needs the runtime.
         let ended = runtime.block_on(async { tokio::time::timeout(limit, last_work).await });
         self.daemon.pool.close();
+        // Here, for a thread that hangs keeps the library from being dropped.
+        self.daemon.library.store().catalog().settle();
         if ended.is_err() {
             tracing::warn!("the drain took longer than {} s", limit.as_secs());
         }

@@ -190,7 +190,7 @@ fn try_to_place(
     let is_cancelled = || daemon.work.progress().is_cancelled(item.job);
     let wanted = || begin.elapsed() < limit && !is_cancelled();
     loop {
-        let work = Placing::Place(&handed, n_bytes);
+        let work = Placing::Place(&handed.words, n_bytes);
         let (text, out_of_memory) = match daemon.pool.place(&item.collection, work, &wanted) {
             Ok(said) => match understood(daemon, &said)? {
                 worker::Outcome::Failed(why) if why.reason == CANCELLED => return Ok(Ok(())),
@@ -243,6 +243,10 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
     match state {
         ItemState::Done(placed) => {
             daemon.metrics.placed(placed);
+            // What was replaced, or was there already.
+            if placed.outcome != crate::library::Outcome::Added {
+                daemon.freed();
+            }
             tracing::info!(
                 collection, shape, outcome = ?placed.outcome, version = placed.version,
                 ms = placed.stages_ms.iter().map(|(_, ms)| ms).sum::<f64>() as u64, "placed"
@@ -262,6 +266,7 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
         }
         ItemState::Cancelled => {
             daemon.metrics.finished("cancelled");
+            daemon.freed();
             tracing::info!(collection, shape, "cancelled");
         }
         ItemState::Queued | ItemState::Running(_) => {

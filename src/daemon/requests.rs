@@ -27,6 +27,10 @@ const MAX_GATES: usize = 1_024;
 const EXTRA_READS: usize = 2;
 /// Requests whose files are written at a time: while one waits for the disk, others compress.
 const MAX_KEEPING: usize = 16;
+/// The same of requests that name files by path: apart, since the file system that they are on may hang.
+const MAX_READING: usize = 64;
+/// How long such a request keeps its turn among those that are taken in while its files are read.
+const KEEPS_TURN: Duration = Duration::from_secs(1);
 
 /// The result and raw frames of a reply.
 pub(crate) type Answer = Result<(reply::Result, Vec<Bytes>), wire::Error>;
@@ -45,6 +49,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
     let readers = Gate::new(daemon.n_workers + EXTRA_READS);
     let computing = Gate::new(daemon.n_workers);
     let keeping = Gate::new(MAX_KEEPING);
+    let reading = Gate::new(MAX_READING);
     let intake = Intake::new(&daemon);
     let mut collections: HashMap<String, Arc<Gate>> = HashMap::new();
     while let Some(mut incoming) = requests.recv().await {
@@ -107,7 +112,12 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             Body::AddShapes(request) => match Room::reserve(&daemon, request.shapes.len()) {
                 Err(full) => in_hand.finish(&daemon, Err(full)),
                 Ok(room) => {
-                    let turns = (keeping.queue(&client), intake.queue(&client));
+                    let gate = if names_files(&request) {
+                        &reading
+                    } else {
+                        &keeping
+                    };
+                    let turns = (gate.queue(&client), intake.queue(&client));
                     let intake = Arc::clone(&intake);
                     tokio::spawn(add_in_turn(daemon, intake, request, room, in_hand, turns));
                 }
@@ -191,6 +201,15 @@ enum Reached {
     Accepted(u64),
 }
 
+/// Whether the daemon is to read files for an addition.
+fn names_files(request: &AddShapesRequest) -> bool {
+    let named = |source: &_| matches!(source, wire::shape_input::Source::Path(_));
+    request
+        .shapes
+        .iter()
+        .any(|s| s.source.as_ref().is_some_and(named))
+}
+
 /// The collection whose labels, or existence, a request changes.
 fn changed_collection(body: &Body) -> Option<&str> {
     Some(match body {
@@ -214,22 +233,39 @@ async fn add_in_turn(
     mut in_hand: InHand,
     (keeping, turn): (Turn, Turn),
 ) {
-    let pass = match in_hand.turn(keeping.come()).await {
-        Ok(pass) => pass,
-        Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
-    };
     let key = in_hand.key();
+    let client = in_hand.incoming.ticket.client().clone();
     let frames = std::mem::take(&mut in_hand.incoming.frames);
     // Given back when the files are there.
     let memory = in_hand.incoming.memory.take();
-    let kept = blocking(&daemon, move |d| {
-        let _here = (memory, pass);
-        intake::keep(d, request, &frames, room, key)
+    let deadline = in_hand.deadline();
+    let may_hang = names_files(&request);
+    let keeper = Arc::clone(&daemon);
+    let kept = async move {
+        let pass = keeping.come().await;
+        blocking(&keeper, move |d| {
+            let _here = (memory, pass);
+            intake::keep(d, request, &frames, room, key, deadline)
+        })
+        .await
+    };
+    let mut kept = std::pin::pin!(kept);
+    let mut turn = Some(turn);
+    let kept = in_hand.until_cut(async {
+        if may_hang {
+            // Whoever comes after it does not wait for a file system that hangs.
+            match tokio::time::timeout(KEEPS_TURN, &mut kept).await {
+                Ok(kept) => return kept,
+                Err(_) => turn = None,
+            }
+        }
+        kept.await
     });
-    let kept = match in_hand.until_cut(kept).await {
+    let kept = match kept.await {
         Ok(kept) => kept,
         Err(why) => return in_hand.cut(&daemon, why, Reached::NotBegun),
     };
+    let turn = turn.unwrap_or_else(|| intake.queue(&client));
     in_hand.incoming.ticket.free_bytes();
     let addition = match kept.unwrap_or_else(|panic| Err(panic_error(&panic))) {
         Ok(addition) => addition,

@@ -62,6 +62,7 @@ pub(crate) fn change(
                 .delete_collection(&r.collection, key)
                 .map_err(refuse)?;
             daemon.work.progress().remove_idle_lane(&r.collection);
+            daemon.freed();
             daemon.notice(Notice::Changed(r.collection.clone()));
             Reply::DeleteCollection(wire::DeleteCollectionReply {})
         }
@@ -78,10 +79,16 @@ pub(crate) fn change(
         | Body::MergeLabels(_)
         | Body::SplitLabel(_)
         | Body::Undo(_)
-        | Body::RemoveShape(_) => asked::change(daemon, body, frames, key)?,
+        | Body::RemoveShape(_) => {
+            let changed = asked::change(daemon, body, frames, key);
+            // Also where it failed: a worker may have ended just after the commit.
+            daemon.freed();
+            changed?
+        }
         Body::CancelJob(r) => {
             let job = library.cancel(r.job_id).map_err(refuse)?;
             daemon.forget_cancelled(&job);
+            daemon.freed();
             Reply::CancelJob(wire::CancelJobReply {
                 job: Some(daemon.job_to_wire(&job)),
             })

@@ -1,9 +1,10 @@
 //! Endpoint URIs become checked addresses: where the daemon listens and where clients find it.
 
+use rustix::fs::OFlags;
 use std::fmt;
 use std::fs;
 use std::net::IpAddr;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 /// Bytes of the path of a Unix socket, as the kernel's `sockaddr_un` has it, less the final NUL.
@@ -203,6 +204,8 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .create(true)
         .truncate(false)
         .write(true)
+        // In a folder for everybody somebody else may have put a link or a pipe there.
+        .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed())
         .open(&lock_path)
         .map_err(io(&lock_path))?;
     let in_use = || EndpointError::InUse {

@@ -6,7 +6,7 @@
 
 use super::rows::{damaged, from_json, to_json};
 use super::{Described, ItemState, JobItem, Library, LibraryError, Result};
-use crate::store::{Digest, ObjectKind, ObjectRow, Store};
+use crate::store::{Digest, Kept, ObjectKind, ObjectRow, Store};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -28,6 +28,14 @@ struct Handed {
     length: u64,
     blake3: String,
     stages_ms: Vec<(String, f64)>,
+}
+
+/// What another process is told of a shape, whose description stays on disk for as long as this is there.
+#[derive(Debug)]
+pub struct HandedOver {
+    /// For [`Library::place_handed`].
+    pub words: Value,
+    _kept: Kept,
 }
 
 impl Handed {
@@ -86,11 +94,12 @@ impl Library {
         Ok(work())
     }
 
-    /// Makes a description durable, for [`Library::place_handed`] in another process.
+    /// Makes a description durable, for [`Library::place_handed`] in another process, which is to end before what this
+    /// returns is dropped.
     ///
     /// # Errors
     /// The description cannot be stored.
-    pub fn hand_over(&self, item: &JobItem, described: &Described) -> Result<Value> {
+    pub fn hand_over(&self, item: &JobItem, described: &Described) -> Result<HandedOver> {
         let begin = Instant::now();
         let object = self.store.objects().put_description(
             described.digest,
@@ -105,12 +114,16 @@ impl Library {
             collection: item.collection.clone(),
             name: item.name.clone(),
             digest: object.digest.to_string(),
-            file: object.file,
+            file: object.file.clone(),
             length: object.length,
             blake3: object.blake3.to_string(),
             stages_ms,
         };
-        Ok(serde_json::to_value(handed).expect("invariant: strings and numbers are JSON"))
+        let words = serde_json::to_value(handed);
+        Ok(HandedOver {
+            words: words.expect("invariant: strings and numbers are JSON"),
+            _kept: object,
+        })
     }
 
     /// [`Library::place_item`] of a description that was handed over.
@@ -255,7 +268,7 @@ mod tests {
                 .ok();
             let handed = holders[0].hand_over(&first.0.items[0], &first.1).unwrap();
             let state = holders[0]
-                .lend("c", || beside.place_handed(&handed))
+                .lend("c", || beside.place_handed(&handed.words))
                 .unwrap();
             let state = state.unwrap();
             assert!(matches!(state, ItemState::Done(_)), "{state:?}");

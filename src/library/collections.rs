@@ -10,7 +10,7 @@ use super::{
 };
 use crate::pipeline::Params;
 use crate::store::catalog::KIND_NAME;
-use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader};
+use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader, Tx};
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -89,7 +89,7 @@ impl Library {
     /// There is none of the name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
-        self.once(key, request, |tx| {
+        let delete = |tx: &Tx<'_>| {
             let row = tx.collection(name)?;
             let row = row.ok_or_else(|| LibraryError::NotFound {
                 what: "collection",
@@ -98,7 +98,8 @@ impl Library {
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
             Ok(Vec::new())
-        })?;
+        };
+        self.store.freeing(|| self.once(key, request, delete))?;
         Ok(())
     }
 

@@ -44,3 +44,9 @@ impl LibraryError {
         Self::InvalidArgument { reason, message }
     }
 }
+
+impl crate::store::FullDisk for LibraryError {
+    fn is_full_disk(&self) -> bool {
+        matches!(self, Self::Store(e) if e.is_full_disk())
+    }
+}

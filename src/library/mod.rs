@@ -54,7 +54,7 @@ mod teach;
 mod types;
 
 pub use agreement::Disagreement;
-pub use apart::{state_from_json, state_to_json};
+pub use apart::{HandedOver, state_from_json, state_to_json};
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
@@ -64,6 +64,7 @@ pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use points::{PointRequest, PolygonValues};
 pub use repair::Repaired;
 pub use rows::report_to_json;
+pub(crate) use submit::check_shape_name;
 pub use submit::{KeptShapes, Submission};
 pub use suggest::Suggestion;
 pub use types::{

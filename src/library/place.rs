@@ -13,8 +13,8 @@ use crate::pipeline::{
     label, map, recluster, unlikeness,
 };
 use crate::store::{
-    Digest, JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ShapeId,
-    ShapeRow,
+    Digest, JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ObjectRow,
+    ShapeId, ShapeRow,
 };
 use std::time::Instant;
 
@@ -72,13 +72,17 @@ impl Library {
         let description = described.description;
         let view = description.view();
         let digest = described.digest;
+        // Until the commit.
+        let _kept;
         let object = match described.stored {
             Some(stored) => stored,
             None => {
                 let objects = self.store.objects();
                 let put = objects.put_description(digest, &description, &described.params_json)?;
                 lap("store");
-                put
+                let row = ObjectRow::clone(&put);
+                _kept = put;
+                row
             }
         };
         let was_pinned = match replaced {

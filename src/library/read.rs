@@ -308,6 +308,11 @@ impl Library {
     /// # Errors
     /// There is no such shape.
     pub fn remove(&self, collection: &str, shape: &str, key: Option<&RequestKey>) -> Result<()> {
+        self.store
+            .freeing(|| self.remove_once(collection, shape, key))
+    }
+
+    fn remove_once(&self, collection: &str, shape: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("remove {collection:?} {shape:?}").as_bytes());
         let row = self.collection_row(collection)?;
         self.with_lane(row, |lane| {

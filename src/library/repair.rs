@@ -9,7 +9,7 @@ use super::submit::{algorithm, params_of};
 use super::{Library, LibraryError, Result};
 use crate::mesh::CleanReport;
 use crate::store::check::Finding;
-use crate::store::quarantine::rebuild_indexes;
+use crate::store::quarantine::{accept_loss, rebuild_indexes};
 use crate::store::{CollectionRow, Digest, ObjectKind, ShapeRow};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -31,10 +31,21 @@ impl Library {
     /// The library is held, or so damaged that it cannot be opened.
     pub fn repair(dir: &Path) -> Result<Repaired> {
         let mut done = Vec::new();
+        let lost = accept_loss(dir)?;
+        done.extend(lost.iter().map(|what| format!("catalog.db: {what}")));
         if rebuild_indexes(dir)? {
             done.push("catalog.db: its indexes were built anew".to_owned());
         }
         let library = Self::open(dir)?;
+        if lost.is_some() {
+            // The sweep would take them for what an addition left that was never accepted.
+            for file in library.store.uncatalogued_originals()? {
+                library.store.put_aside(&file)?;
+                done.push(format!(
+                    "{file}: a mesh that no row names was put into quarantine/: it can be added again"
+                ));
+            }
+        }
         let rows = library.store.catalog().read(|r| -> Result<_> {
             let mut rows = Vec::new();
             for collection in r.collections()? {

@@ -12,7 +12,7 @@ use crate::mesh::{CleanError, CleanReport, ParseError};
 use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, READING_VERSION};
 use crate::spectrum::SpectrumError;
 use crate::store::{
-    CollectionRow, Digest, ItemStatus, JobItemRow, NewJobItem, ObjectKind, ObjectRow, RequestRow,
+    CollectionRow, Digest, ItemStatus, JobItemRow, Kept, NewJobItem, ObjectKind, RequestRow,
     ShapeRow, Tx,
 };
 use std::cell::RefCell;
@@ -24,8 +24,15 @@ const MAX_SHAPE_NAME: usize = 255;
 /// Shapes whose files are durable, and that count once they are submitted.
 #[derive(Debug, Default)]
 pub struct KeptShapes {
-    objects: Vec<ObjectRow>,
+    objects: Vec<Kept>,
     items: Vec<NewJobItem>,
+}
+
+impl KeptShapes {
+    /// None, to be kept one after the other.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 /// Shapes that a request adds to a collection.
@@ -55,6 +62,11 @@ impl Submission<'_> {
     }
 }
 
+/// Refuses a name that no shape may have.
+pub(crate) fn check_shape_name(name: &str) -> Result<()> {
+    check_name("shape", name, MAX_SHAPE_NAME)
+}
+
 impl Library {
     /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may do so at a time.
     ///
@@ -62,20 +74,30 @@ impl Library {
     /// A bad name; the disk.
     pub fn keep(&self, shapes: Vec<NewShape>) -> Result<KeptShapes> {
         for s in &shapes {
-            check_name("shape", &s.name, MAX_SHAPE_NAME)?;
+            check_shape_name(&s.name)?;
         }
         let mut kept = KeptShapes::default();
         for s in shapes {
-            let object = self.store.objects().put_original(&s.bytes)?;
-            kept.items.push(NewJobItem {
-                name: s.name,
-                original_digest: object.digest,
-                format: s.format.name().into(),
-                replace: s.replace,
-            });
-            kept.objects.push(object);
+            self.keep_another(&mut kept, s)?;
         }
         Ok(kept)
+    }
+
+    /// Writes the file of one more shape, as [`Library::keep`] does, so that they need not be in memory together.
+    ///
+    /// # Errors
+    /// A bad name; the disk.
+    pub fn keep_another(&self, kept: &mut KeptShapes, shape: NewShape) -> Result<()> {
+        check_shape_name(&shape.name)?;
+        let object = self.store.objects().put_original(&shape.bytes)?;
+        kept.items.push(NewJobItem {
+            name: shape.name,
+            original_digest: object.digest,
+            format: shape.format.name().into(),
+            replace: shape.replace,
+        });
+        kept.objects.push(object);
+        Ok(())
     }
 
     /// Accepts shapes: when this returns a job with them is durable. The same key gives the same job again.
@@ -173,7 +195,7 @@ impl Library {
     /// There is no such job.
     pub fn cancel(&self, job: u64) -> Result<Job> {
         self.job(job)?;
-        self.store.catalog().write(|tx| -> Result<()> {
+        let cancel = |tx: &Tx<'_>| -> Result<()> {
             for item in tx
                 .job_items(job)?
                 .iter()
@@ -182,7 +204,8 @@ impl Library {
                 tx.set_item(job, item.index, ItemStatus::Cancelled, None)?;
             }
             Ok(())
-        })?;
+        };
+        self.store.freeing(|| self.store.catalog().write(cancel))?;
         self.job(job)
     }
 

@@ -6,6 +6,7 @@
 use super::agreement::KeptMaps;
 use super::catalog::KEPT_LABEL_VERSIONS;
 use super::catalog::schema::TABLES;
+use super::catalog::witness::{self, Found, WITNESS_FILE, Witness};
 use super::catalog::{self, Reader};
 use super::disk::{Disk, RealDisk};
 use super::error::CATALOG_FILE;
@@ -45,6 +46,15 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     let mut findings = Findings::default();
     let path = catalog::path_in(dir);
     std::fs::metadata(dir).map_err(|e| StoreError::io(dir, e))?;
+    let witness = Witness::read(&path)?;
+    if let Found::Damaged(what) = &witness {
+        findings.damage(WITNESS_FILE, what);
+    }
+    let shortfall = witness::shortfall(&path)?;
+    let is_short = shortfall.is_some();
+    if let Some(shortfall) = shortfall {
+        findings.damage(CATALOG_FILE, shortfall.what);
+    }
     if !path.is_file() {
         findings.damage(CATALOG_FILE, "the catalog is missing");
         return Ok(findings.list);
@@ -90,7 +100,21 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     findings.take("events", |f| check_events(&connection, f));
     findings.take("jobs", |f| check_jobs(&connection, &reader, f));
     drop(connection);
-    check_orphans(dir, &rows, &path, &mut findings)?;
+    let n_orphans = check_orphans(dir, &rows, &path, &mut findings)?;
+    let text = format!("{n_orphans} shapes are in the store and not in the catalog");
+    match witness {
+        _ if n_orphans == 0 => {}
+        _ if is_short => findings.damage("originals", text),
+        // What was being added when a process ended, and no more.
+        Found::Whole(_) => {}
+        Found::Missing | Found::Damaged(_) => findings.note(
+            "originals".into(),
+            format!(
+                "{text}, and without {WITNESS_FILE} nothing tells whether it held them once: if \
+                 these are more than were being added at a time, restore a snapshot"
+            ),
+        ),
+    }
     Ok(findings.list)
 }
 
@@ -509,21 +533,23 @@ fn check_jobs(
     Ok(())
 }
 
+/// Names files that no row names; how many of them are mesh files.
 fn check_orphans(
     dir: &Path,
     rows: &[ObjectRow],
     catalog: &Path,
     findings: &mut Findings,
-) -> Result<(), StoreError> {
+) -> Result<usize, StoreError> {
     let named: HashSet<&str> = rows.iter().map(|row| row.file.as_str()).collect();
     let connection = match catalog::open_reader(catalog) {
         Ok(connection) => connection,
         Err(error) => {
             findings.error(&error);
-            return Ok(());
+            return Ok(0);
         }
     };
     let reader = Reader::new(&connection);
+    let mut n_originals = 0;
     for folder in FOLDERS {
         let path = dir.join(folder);
         for entry in RealDisk
@@ -535,13 +561,10 @@ fn check_orphans(
             if named.contains(file.as_str()) || reader.is_catalogued(&file).unwrap_or(false) {
                 continue;
             }
+            n_originals += usize::from(folder == ObjectKind::Original.folder());
             let message = format!("{} bytes that no row names", entry.length);
-            findings.list.push(Finding {
-                place: file,
-                message,
-                damage: false,
-            });
+            findings.note(file, message);
         }
     }
-    Ok(())
+    Ok(n_originals)
 }

@@ -1,7 +1,10 @@
 //! The few file operations that object files are made with, so that each can be made to fail.
 
+use rustix::fs::OFlags;
+use rustix::io::Errno;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read as _, Write};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -52,6 +55,35 @@ pub struct RealDisk;
 
 struct RealFile(File);
 
+/// Opens a file that a library holds: not a link, a device or a pipe that somebody has put in its place, which might never
+/// end.
+pub(super) fn open_regular(path: &Path) -> io::Result<File> {
+    let other = || io::Error::new(io::ErrorKind::InvalidData, "it is not a regular file");
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let opened = File::options()
+        .read(true)
+        .custom_flags(flags.bits().cast_signed())
+        .open(path);
+    let file = match opened.map_err(|e| (Errno::from_io_error(&e), e)) {
+        Ok(file) => file,
+        // A link; a socket.
+        Err((Some(Errno::LOOP | Errno::NXIO), _)) => return Err(other()),
+        Err((_, e)) => return Err(e),
+    };
+    match file.metadata()?.is_file() {
+        true => Ok(file),
+        false => Err(other()),
+    }
+}
+
+/// Whether an error of [`open_regular`] says that the file is not there any more, as opposed to a trouble that passes.
+pub(super) fn is_gone(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::NotFound | io::ErrorKind::InvalidData
+    )
+}
+
 impl NewFile for RealFile {
     fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.0.write_all(bytes)
@@ -98,7 +130,11 @@ impl Disk for RealDisk {
     }
 
     fn read(&self, path: &Path) -> io::Result<Vec<u8>> {
-        fs::read(path)
+        let mut file = open_regular(path)?;
+        let length = file.metadata()?.len();
+        let mut bytes = Vec::with_capacity(usize::try_from(length).map_err(io::Error::other)?);
+        file.read_to_end(&mut bytes)?;
+        Ok(bytes)
     }
 
     fn files(&self, dir: &Path) -> io::Result<Vec<Entry>> {

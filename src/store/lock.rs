@@ -5,12 +5,15 @@ use rustix::fs::{FlockOperation, flock};
 use rustix::io::{FdFlags, fcntl_setfd};
 use rustix::process::{Pid, test_kill_process};
 use std::fs::File;
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// The file that is locked, in the library's folder.
 pub const LOCK_FILE: &str = "lock";
+
+/// The folder in a library that readers lock against the removal of files.
+const LOCKED_FOLDER: &str = "objects";
 
 /// A process that was killed may have left a child between fork and exec, which shares its open files
 /// for a moment.
@@ -82,4 +85,60 @@ fn patience(lock: &Path) -> Duration {
         Some(Err(rustix::io::Errno::SRCH)) => PATIENCE_AFTER_DEATH,
         _ => PATIENCE,
     }
+}
+
+/// A folder that is locked; the folder itself, so that it needs no file and no right to write.
+#[derive(Debug)]
+pub(super) struct Locked(File);
+
+impl Drop for Locked {
+    fn drop(&mut self) {
+        // As for [`LibraryLock`].
+        let _ = flock(&self.0, FlockOperation::Unlock);
+    }
+}
+
+impl Locked {
+    /// Locks a folder for this alone, if nobody else has it locked.
+    pub(super) fn try_exclusive(folder: &Path) -> io::Result<Option<Self>> {
+        let locked = Self(File::open(folder)?);
+        match flock(&locked.0, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(Some(locked)),
+            Err(rustix::io::Errno::WOULDBLOCK) => Ok(None),
+            Err(errno) => Err(errno.into()),
+        }
+    }
+
+    fn shared(folder: &Path) -> io::Result<Self> {
+        let locked = Self(File::open(folder)?);
+        flock(&locked.0, FlockOperation::LockShared)?;
+        Ok(locked)
+    }
+}
+
+/// While it is there no file of a library is removed, in whichever process: for whoever reads the catalog and then, one
+/// after the other, the files that it names.
+#[derive(Debug)]
+pub(super) struct Reading {
+    _locked: Option<Locked>,
+}
+
+impl Reading {
+    pub(super) fn begin(library: &Path) -> Result<Self, StoreError> {
+        let folder = library.join(LOCKED_FOLDER);
+        match Locked::shared(&folder) {
+            Ok(locked) => Ok(Self {
+                _locked: Some(locked),
+            }),
+            // Then there are no files.
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(Self { _locked: None }),
+            Err(e) => Err(StoreError::io(&folder, e)),
+        }
+    }
+}
+
+/// For whoever removes files; nothing while somebody reads.
+pub(super) fn try_removing(library: &Path) -> Result<Option<Locked>, StoreError> {
+    let folder = library.join(LOCKED_FOLDER);
+    Locked::try_exclusive(&folder).map_err(|e| StoreError::io(&folder, e))
 }

@@ -10,6 +10,7 @@
 use super::Digest;
 pub use super::array_file::{ARRAY_FORMAT, ArrayFileError, write_description};
 use super::array_file::{Layout, check_indices};
+use super::disk::open_regular;
 use crate::mesh::CleanReport;
 use crate::pipeline::{Description, DescriptionView};
 use memmap2::{Advice, Mmap};
@@ -43,10 +44,9 @@ impl MappedDescription {
         expected_len: u64,
         expected_blake3: Option<[u8; 32]>,
     ) -> Result<Self, ArrayFileError> {
-        let file = File::open(path)?;
-        let metadata = file.metadata()?;
-        let found = metadata.len();
-        if !metadata.is_file() || found != expected_len {
+        let file = open_regular(path)?;
+        let found = file.metadata()?.len();
+        if found != expected_len {
             return Err(ArrayFileError::Length {
                 found,
                 expected: expected_len,

@@ -15,7 +15,8 @@
 //!
 //! A sync that fails makes the store read-only for as long as the process lives ([`Health`]); a full
 //! disk is an error that passes. Committed files never change. The catalog has one writer, and
-//! readers never wait for it. Orphans are swept when they are a day old, never at start.
+//! readers never wait for it. Files that nothing refers to any more are removed soon, what a process
+//! left that ended in the middle when it is a day old, never at start.
 
 pub mod agreement;
 mod array_file;
@@ -33,6 +34,7 @@ pub mod lock;
 pub mod mapped;
 pub mod objects;
 pub mod quarantine;
+mod reserve;
 pub mod rows;
 pub mod snapshot;
 
@@ -43,7 +45,7 @@ pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
 pub use health::Health;
 pub use mapped::MappedDescription;
-pub use objects::Objects;
+pub use objects::{Kept, Objects};
 pub use rows::{
     CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
     LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
@@ -91,6 +93,9 @@ impl Store {
         let catalog = open_catalog(&catalog::path_in(dir), health.clone())?;
         let disk: Arc<dyn Disk> = Arc::new(RealDisk);
         let objects = Objects::open(disk, dir, health.clone())?;
+        if lock.is_some() {
+            reserve::keep(dir);
+        }
         Ok(Self {
             objects,
             catalog,
@@ -129,24 +134,118 @@ impl Store {
         &self.dir
     }
 
+    /// Lets go what no shape and no queued item needs any more: its rows now, its files for [`Store::reclaim`]. How many.
+    pub fn release_unreferenced(&self) -> Result<usize, StoreError> {
+        // Looked for beside the writer first, which mostly has nothing to do.
+        if !self
+            .catalog
+            .read(|reader| reader.has_unreferenced_objects())?
+        {
+            return Ok(0);
+        }
+        let released =
+            self.freeing(|| self.catalog.write(|tx| tx.delete_unreferenced_objects()))?;
+        let n_files = released.len();
+        tracing::debug!(n_files, "released unreferenced object files");
+        self.objects.let_go(released);
+        Ok(n_files)
+    }
+
+    /// Removes the files that this process has let go so long ago, unless a row names them again or somebody is about to
+    /// name them. Returns the removed files; while a copy of the library is made, in whichever process, there are none.
+    pub fn reclaim(&self, grace: Duration) -> Result<Vec<String>, StoreError> {
+        let mut files = Vec::new();
+        for file in self.objects.let_go_since(grace) {
+            if self.is_catalogued(&file)? {
+                self.objects.still_needed(&file);
+            } else {
+                files.push(file);
+            }
+        }
+        if files.is_empty() {
+            return Ok(files);
+        }
+        let Some(_removing) = lock::try_removing(&self.dir)? else {
+            return Ok(Vec::new());
+        };
+        self.bury_interrupted_commits()?;
+        let mut removed = Vec::new();
+        for file in files {
+            if self
+                .objects
+                .remove(&file, |file| self.is_catalogued(file))?
+            {
+                removed.push(file);
+            }
+        }
+        Ok(removed)
+    }
+
     /// Removes what nothing needs any more: the rows of unreferenced object files now, files
     /// without a row once they have been orphans for `min_age` (of what this process did not do
     /// itself, the file's age counts). Returns the removed files.
     ///
     /// For a daemon to call about hourly with [`objects::ORPHAN_AGE`], never at start.
     pub fn sweep_orphans(&self, min_age: Duration) -> Result<Vec<String>, StoreError> {
-        // Held before the rows are gone: a reader that found the row may still open the file.
-        let released = self.catalog.write(|tx| {
-            let files = tx.delete_unreferenced_objects()?;
-            self.objects.hold(files.iter().cloned());
-            Ok::<_, StoreError>(files)
-        })?;
-        tracing::debug!(
-            n_files = released.len(),
-            "released unreferenced object files"
-        );
-        let catalogued = |file: &str| self.catalog.read(|reader| reader.is_catalogued(file));
-        self.objects.sweep(min_age, catalogued)
+        self.release_unreferenced()?;
+        let Some(_removing) = lock::try_removing(&self.dir)? else {
+            return Ok(Vec::new());
+        };
+        self.bury_interrupted_commits()?;
+        self.objects.sweep(min_age, |file| self.is_catalogued(file))
+    }
+
+    /// Mesh files that no row names.
+    pub(crate) fn uncatalogued_originals(&self) -> Result<Vec<String>, StoreError> {
+        let folder = self.dir.join(ObjectKind::Original.folder());
+        let files = RealDisk.files(&folder);
+        let mut found = Vec::new();
+        for entry in files.map_err(|e| StoreError::io(&folder, e))? {
+            let file = objects::relative(&self.dir, &entry.path);
+            if !self.is_catalogued(&file)? {
+                found.push(file);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Carries out a change that frees space; on a full disk once more, with the room that is kept for it.
+    pub fn freeing<T, E: FullDisk>(
+        &self,
+        mut change: impl FnMut() -> Result<T, E>,
+    ) -> Result<T, E> {
+        match change() {
+            Err(e) if e.is_full_disk() && reserve::give_up(&self.dir) => change(),
+            done => done,
+        }
+    }
+
+    /// Keeps room for changes that free space, if there is more than that.
+    pub fn keep_reserve(&self) {
+        reserve::keep(&self.dir);
+    }
+
+    fn is_catalogued(&self, file: &str) -> Result<bool, StoreError> {
+        self.catalog.read(|reader| reader.is_catalogued(file))
+    }
+
+    /// A process that was killed at the end of its commit may have left it whole in the log, where nobody sees it until the
+    /// log is recovered after a crash. Files that it names must not be gone by then: the commit that this makes is written
+    /// over it.
+    fn bury_interrupted_commits(&self) -> Result<(), StoreError> {
+        self.freeing(|| self.catalog.write(|tx| tx.touch()))
+    }
+}
+
+/// Errors that may say that the disk is full.
+pub trait FullDisk: From<StoreError> {
+    /// Whether it is, and nothing was changed.
+    fn is_full_disk(&self) -> bool;
+}
+
+impl FullDisk for StoreError {
+    fn is_full_disk(&self) -> bool {
+        matches!(self, Self::NoSpace { .. })
     }
 }
 

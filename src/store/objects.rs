@@ -2,13 +2,14 @@
 //!
 //! A file is written under `tmp/`, synced, renamed to its place and its folder is synced; only then
 //! does the caller write the catalog row that names it, with length and digest. That row is the only
-//! commit marker: a file without one does not count and is swept after a day. A file in its place is
+//! commit marker: a file without one does not count. What this process put or let go is removed soon
+//! after nothing needs it; what another left behind is swept after a day. A file in its place is
 //! complete and never changes; where other bytes turn out to be needed under a name that is taken,
 //! they get a name of their own beside it, so that a row never speaks of bytes that were replaced.
 
 use super::array_file::DescriptionFile;
 use super::codec::decompress;
-use super::disk::Disk;
+use super::disk::{Disk, is_gone};
 use super::error::is_no_space;
 use super::mapped::{ArrayFileError, MappedDescription};
 use super::rows::{ObjectKind, ObjectRow};
@@ -16,6 +17,7 @@ use super::{Digest, Health, StoreError};
 use crate::pipeline::Description;
 use std::collections::{HashMap, HashSet};
 use std::io;
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -42,13 +44,15 @@ pub struct Objects {
     /// One file of a name is published at a time, so that nobody finds a name that may yet be taken back. By the first
     /// digits, so that files under different folders do not wait for each other.
     publishing: [Mutex<()>; 256],
-    state: Mutex<State>,
+    state: Arc<Mutex<State>>,
 }
 
 struct State {
-    /// Files that something in this process may be about to name in the catalog, or to open, and
-    /// since when. The monotonic clock decides, so that a jump of the wall clock sweeps nothing.
-    held: HashMap<String, Instant>,
+    /// Files that something in this process may be about to name in the catalog, and by how many.
+    held: HashMap<String, usize>,
+    /// Files that nobody holds any more, or whose rows are gone, and since when: whoever found a row may be about to open
+    /// its file. The monotonic clock decides, so that a jump of the wall clock removes nothing.
+    let_go: HashMap<String, Instant>,
     /// Folders whose own names are durable.
     durable_folders: HashSet<String>,
     n_temporary: u64,
@@ -57,8 +61,56 @@ struct State {
     cache_bytes: usize,
 }
 
+/// The row of a file that was put, for the caller to commit. Nobody removes the file while this is there: it is to be
+/// dropped after the commit.
+#[derive(Debug)]
+pub struct Kept {
+    row: ObjectRow,
+    _hold: Hold,
+}
+
+impl Deref for Kept {
+    type Target = ObjectRow;
+
+    fn deref(&self) -> &ObjectRow {
+        &self.row
+    }
+}
+
+/// Keeps a file, named relative to the library, from being removed.
+struct Hold {
+    file: String,
+    state: Arc<Mutex<State>>,
+}
+
+impl std::fmt::Debug for Hold {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Hold").field(&self.file).finish()
+    }
+}
+
+impl Drop for Hold {
+    fn drop(&mut self) {
+        let mut state = locked(&self.state);
+        let n = state.held.get_mut(&self.file);
+        match n {
+            Some(n) if *n > 1 => *n -= 1,
+            _ => {
+                state.held.remove(&self.file);
+                // If it was committed, the catalog says so when it is to be removed.
+                state.let_go.insert(self.file.clone(), Instant::now());
+            }
+        }
+    }
+}
+
+fn locked(state: &Mutex<State>) -> MutexGuard<'_, State> {
+    // Every change of the state is complete in itself, so a panic elsewhere left it whole.
+    state.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl ObjectKind {
-    fn folder(self) -> &'static str {
+    pub(super) fn folder(self) -> &'static str {
         match self {
             Self::Description => "objects",
             Self::Original => "originals",
@@ -81,13 +133,14 @@ impl Objects {
             root: root.to_path_buf(),
             health,
             publishing: std::array::from_fn(|_| Mutex::new(())),
-            state: Mutex::new(State {
+            state: Arc::new(Mutex::new(State {
                 held: HashMap::new(),
+                let_go: HashMap::new(),
                 durable_folders: HashSet::new(),
                 n_temporary: 0,
                 cache: Vec::new(),
                 cache_bytes: DEFAULT_CACHE_BYTES,
-            }),
+            })),
         };
         for folder in FOLDERS {
             let path = root.join(folder);
@@ -110,7 +163,7 @@ impl Objects {
         digest: Digest,
         description: &Description,
         params_json: &str,
-    ) -> Result<ObjectRow, StoreError> {
+    ) -> Result<Kept, StoreError> {
         let file = DescriptionFile::new(description, params_json)?;
         let pieces = file.pieces();
         self.put(ObjectKind::Description, digest, &pieces, |stored| {
@@ -119,7 +172,7 @@ impl Objects {
     }
 
     /// Stores the bytes of a mesh file, compressed, and returns the row that makes them count.
-    pub fn put_original(&self, bytes: &[u8]) -> Result<ObjectRow, StoreError> {
+    pub fn put_original(&self, bytes: &[u8]) -> Result<Kept, StoreError> {
         let digest = Digest::of(bytes);
         let path = self.root.join(ObjectKind::Original.folder());
         let compressed =
@@ -155,25 +208,70 @@ impl Objects {
         state.trim_cache();
     }
 
-    /// Keeps files, named relative to the library, from being swept for a day.
-    pub(super) fn hold(&self, files: impl IntoIterator<Item = String>) {
+    /// Keeps nothing mapped that is not in use.
+    pub fn unmap(&self) {
+        self.state().cache.clear();
+    }
+
+    /// Notes that the rows of these files, named relative to the library, are gone.
+    pub(super) fn let_go(&self, files: impl IntoIterator<Item = String>) {
         let now = Instant::now();
         self.state()
-            .held
+            .let_go
             .extend(files.into_iter().map(|file| (file, now)));
     }
 
-    /// Removes files that are neither catalogued nor younger than `min_age`, and returns their
-    /// names. What this process wrote or let go is aged by the monotonic clock.
+    /// Notes that a file which was let go is named by a row after all.
+    pub(super) fn still_needed(&self, file: &str) {
+        self.state().let_go.remove(file);
+    }
+
+    /// Files that were let go so long ago, and that nobody has held since.
+    pub(super) fn let_go_since(&self, min_age: Duration) -> Vec<String> {
+        let state = self.state();
+        let old = state.let_go.iter().filter(|(file, since)| {
+            since.elapsed() >= min_age && !state.held.contains_key(file.as_str())
+        });
+        old.map(|(file, _)| file.clone()).collect()
+    }
+
+    /// Removes a file that is neither catalogued nor held; whether it did.
+    pub(super) fn remove(
+        &self,
+        file: &str,
+        catalogued: impl Fn(&str) -> Result<bool, StoreError>,
+    ) -> Result<bool, StoreError> {
+        self.health.writable()?;
+        // Held until the file is gone: a put of the same name announces itself first, and keeps its hold until its row is
+        // committed. So whoever is to name the file is seen here, or in the catalog.
+        let mut state = self.state();
+        if state.held.contains_key(file) {
+            return Ok(false);
+        }
+        let is_needed = catalogued(file)?;
+        state.let_go.remove(file);
+        if is_needed {
+            return Ok(false);
+        }
+        let path = self.root.join(file);
+        match self.disk.remove(&path) {
+            Ok(()) => {}
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
+            Err(e) => return Err(StoreError::io(&path, e)),
+        }
+        // Mapped, it would take up its space.
+        state.cache.retain(|(mapped, ..)| mapped != file);
+        Ok(true)
+    }
+
+    /// Removes files that are neither catalogued, nor held, nor younger than `min_age`, and returns their
+    /// names. What this process let go is aged by the monotonic clock.
     pub(super) fn sweep(
         &self,
         min_age: Duration,
         catalogued: impl Fn(&str) -> Result<bool, StoreError>,
     ) -> Result<Vec<String>, StoreError> {
         self.health.writable()?;
-        self.state()
-            .held
-            .retain(|_, since| since.elapsed() < min_age);
         let mut swept = Vec::new();
         for folder in FOLDERS {
             let path = self.root.join(folder);
@@ -184,22 +282,25 @@ impl Objects {
             {
                 let file = relative(&self.root, &entry.path);
                 // A time in the future is no age at all.
-                let old = entry.modified.elapsed().is_ok_and(|age| age >= min_age);
-                if !old || catalogued(&file)? {
-                    continue;
+                let by_clock = entry.modified.elapsed().is_ok_and(|age| age >= min_age);
+                let old = match self.state().let_go.get(&file) {
+                    Some(since) => since.elapsed() >= min_age,
+                    None => by_clock,
+                };
+                if old && self.remove(&file, &catalogued)? {
+                    swept.push(file);
                 }
-                // Held until the file is gone: a put of the same name announces itself first.
-                let state = self.state();
-                if state.held.contains_key(&file) {
-                    continue;
-                }
-                self.disk
-                    .remove(&entry.path)
-                    .map_err(|e| StoreError::io(&entry.path, e))?;
-                swept.push(file);
             }
         }
         Ok(swept)
+    }
+
+    fn hold(&self, file: &str) -> Hold {
+        *self.state().held.entry(file.to_owned()).or_default() += 1;
+        Hold {
+            file: file.to_owned(),
+            state: Arc::clone(&self.state),
+        }
     }
 
     fn put(
@@ -208,7 +309,7 @@ impl Objects {
         digest: Digest,
         pieces: &[&[u8]],
         same: impl Fn(&[u8]) -> bool,
-    ) -> Result<ObjectRow, StoreError> {
+    ) -> Result<Kept, StoreError> {
         self.health.writable()?;
         let hex = digest.to_string();
         let folder = format!("{}/{}", kind.folder(), &hex[..2]);
@@ -222,34 +323,37 @@ impl Objects {
         let names = [hex.clone(), format!("{hex}-{beside}")];
         for name in names {
             let file = format!("{folder}/{name}.{}", kind.extension());
-            self.hold([file.clone()]);
+            let hold = self.hold(&file);
             let path = self.root.join(&file);
             match self.disk.read(&path) {
                 // Durable: it was synced before it got this name, and the name was there when
                 // `make_folder` synced the folder, or was published since.
                 Ok(stored) if same(&stored) => {
                     let (length, blake3) = (stored.len() as u64, Digest::of(&stored));
-                    return Ok(ObjectRow {
+                    let row = ObjectRow {
                         kind,
                         digest,
                         file,
                         length,
                         blake3,
-                    });
+                    };
+                    return Ok(Kept { row, _hold: hold });
                 }
                 // Other bytes: either damaged, or written by another version and named by a row.
                 Ok(_) => continue,
+                Err(e) if e.kind() == io::ErrorKind::InvalidData => continue,
                 Err(e) if e.kind() == io::ErrorKind::NotFound => {}
                 Err(e) => return Err(StoreError::io(&path, e)),
             }
             self.publish(&self.root.join(&folder), &path, pieces)?;
-            return Ok(ObjectRow {
+            let row = ObjectRow {
                 kind,
                 digest,
                 file,
                 length: pieces.iter().map(|p| p.len() as u64).sum(),
                 blake3,
-            });
+            };
+            return Ok(Kept { row, _hold: hold });
         }
         Err(damaged(
             &format!("{folder}/{hex}"),
@@ -290,13 +394,12 @@ impl Objects {
 
     /// Temporary file, sync, rename, sync of the folder.
     fn publish(&self, folder: &Path, path: &Path, pieces: &[&[u8]]) -> Result<(), StoreError> {
-        let (temporary, name) = self.temporary();
+        let (temporary, _hold) = self.temporary();
         let written = self.write_synced(&temporary, pieces).and_then(|()| {
             self.disk
                 .rename(&temporary, path)
                 .map_err(|e| StoreError::io(path, e))
         });
-        self.state().held.remove(&name);
         if let Err(error) = written {
             // If this fails too, the sweep finds the file.
             let _ = self.disk.remove(&temporary);
@@ -334,17 +437,20 @@ impl Objects {
         }
     }
 
-    /// A path for a new temporary file, held; and its name relative to the library.
-    fn temporary(&self) -> (PathBuf, String) {
+    /// A path for a new temporary file, and what keeps it from being swept.
+    fn temporary(&self) -> (PathBuf, Hold) {
         loop {
-            let mut state = self.state();
-            state.n_temporary += 1;
-            let name = format!("{TEMPORARY}/{}-{}", std::process::id(), state.n_temporary);
+            let n = {
+                let mut state = self.state();
+                state.n_temporary += 1;
+                state.n_temporary
+            };
+            let name = format!("{TEMPORARY}/{}-{n}", std::process::id());
             let path = self.root.join(&name);
+            let hold = self.hold(&name);
             // An earlier process with the same id may have left one behind.
             if !self.disk.exists(&path) {
-                state.held.insert(name.clone(), Instant::now());
-                return (path, name);
+                return (path, hold);
             }
         }
     }
@@ -362,8 +468,7 @@ impl Objects {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        // Every change of the state is complete in itself, so a panic elsewhere left it whole.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.state)
     }
 }
 
@@ -388,9 +493,7 @@ pub(super) fn map_description(
     let path = root.join(&row.file);
     match MappedDescription::open(&path, row.length, Some(row.blake3.0)) {
         Ok(mapped) => Ok(mapped),
-        Err(ArrayFileError::Io(e)) if e.kind() != io::ErrorKind::NotFound => {
-            Err(StoreError::io(&path, e))
-        }
+        Err(ArrayFileError::Io(e)) if !is_gone(&e) => Err(StoreError::io(&path, e)),
         Err(e) => Err(damaged(&row.file, e)),
     }
 }
@@ -404,7 +507,7 @@ pub(super) fn read_original(
     let path = root.join(&row.file);
     let stored = match disk.read(&path) {
         Ok(stored) => stored,
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(damaged(&row.file, e)),
+        Err(e) if is_gone(&e) => return Err(damaged(&row.file, e)),
         Err(e) => return Err(StoreError::io(&path, e)),
     };
     let (found, expected) = (stored.len() as u64, row.length);

@@ -1,12 +1,13 @@
 //! What is damaged is put aside, never deleted: files, and the catalog as it was before it was mended.
 
-use super::catalog::{self, schema};
+use super::catalog::witness::{self, Found, Shortfall, Witness};
+use super::catalog::{self, log, schema};
 use super::disk::{Disk, RealDisk};
 use super::lock::LibraryLock;
 use super::{Store, StoreError};
 use rusqlite::Connection;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The folder in a library for what was put aside.
 pub const QUARANTINE: &str = "quarantine";
@@ -33,18 +34,7 @@ pub fn rebuild_indexes(dir: &Path) -> Result<bool, StoreError> {
     }
     // Into one file, so that the copy has all of it.
     connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
-    let kept = dir.join(QUARANTINE);
-    let make = |e| StoreError::io(&kept, e);
-    RealDisk.create_dir(&kept).map_err(make)?;
-    let mut n = 1;
-    let copy = loop {
-        let copy = kept.join(format!("catalog-{n}.db"));
-        if !copy.exists() {
-            break copy;
-        }
-        n += 1;
-    };
-    fs::copy(&path, &copy).map_err(|e| StoreError::io(&copy, e))?;
+    keep_catalog(dir)?;
     connection.execute_batch("REINDEX")?;
     let found = integrity(&connection)?;
     if found == "ok" {
@@ -54,6 +44,91 @@ pub fn rebuild_indexes(dir: &Path) -> Result<bool, StoreError> {
         path: super::error::CATALOG_FILE.to_owned(),
         message: format!("{found}; rebuilding its indexes did not help"),
     })
+}
+
+/// Goes on with what there is of a catalog that lacks changes it once held, because its log is damaged, missing, cut or of
+/// another time; what was there before is put aside. What was lost, in words, or nothing. No process may hold the library.
+///
+/// # Errors
+/// The library is held, or there is no catalog of it to go on with.
+pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
+    let _lock = LibraryLock::acquire(dir)?;
+    let path = catalog::path_in(dir);
+    let log_path = catalog::log_of(&path);
+    let damaged = log::damage(&log_path).map_err(|e| StoreError::io(&log_path, e))?;
+    let shortfall = witness::shortfall(&path)?;
+    let what = match (&damaged, &shortfall) {
+        (None, None) => return Ok(None),
+        (_, Some(shortfall)) => shortfall.what.clone(),
+        (Some(damaged), None) => damaged.clone(),
+    };
+    let refused = || StoreError::Damaged {
+        path: super::error::CATALOG_FILE.to_owned(),
+        message: format!("{what}; there is nothing to go on with: restore a snapshot"),
+    };
+    if !path.exists() {
+        return Err(refused());
+    }
+    let copy = keep_catalog(dir)?;
+    let foreign_log = |s: &Shortfall| s.foreign_log;
+    if shortfall.as_ref().is_some_and(foreign_log) {
+        let mut index = path.clone().into_os_string();
+        index.push("-shm");
+        for file in [&log_path, &PathBuf::from(index)] {
+            match fs::remove_file(file) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(StoreError::io(file, e));
+                }
+                _ => {}
+            }
+        }
+    }
+    let connection = Connection::open(&path)?;
+    schema::register_row_sum(&connection)?;
+    connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
+    let reader = catalog::Reader::new(&connection);
+    let (library, committed) = (reader.library_id()?, reader.n_commits()?);
+    if let Found::Whole(old) = Witness::read(&path)?
+        && old.library != library
+    {
+        return Err(refused());
+    }
+    let witness = Witness {
+        library,
+        settled: committed,
+        committed,
+    };
+    witness.write(&path)?;
+    let copy = copy.strip_prefix(dir).unwrap_or(&copy).display();
+    Ok(Some(format!(
+        "{what}; it goes on as of change {committed}, and {copy} is what was there"
+    )))
+}
+
+/// Copies the catalog and its log into the quarantine; where the copy is.
+fn keep_catalog(dir: &Path) -> Result<PathBuf, StoreError> {
+    let path = catalog::path_in(dir);
+    let kept = dir.join(QUARANTINE);
+    let make = |e| StoreError::io(&kept, e);
+    RealDisk.create_dir(&kept).map_err(make)?;
+    let free = |n: &u32| !kept.join(format!("catalog-{n}.db")).exists();
+    let n = (1..).find(free).expect("invariant: numbers do not end");
+    let copy = kept.join(format!("catalog-{n}.db"));
+    for (from, to) in [
+        (path.clone(), copy.clone()),
+        (catalog::log_of(&path), catalog::log_of(&copy)),
+    ] {
+        match fs::copy(&from, &to) {
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+            Err(e) => return Err(StoreError::io(&to, e)),
+            Ok(_) => {
+                let synced = fs::File::open(&to).and_then(|f| f.sync_all());
+                synced.map_err(|e| StoreError::io(&to, e))?;
+            }
+        }
+    }
+    RealDisk.sync_dir(&kept).map_err(make)?;
+    Ok(copy)
 }
 
 impl Store {

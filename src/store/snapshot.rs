@@ -1,11 +1,14 @@
 //! A library becomes a copy of itself as of one moment, also while it is in use.
 //!
 //! The catalog is copied in one read transaction, then the files that the copy names: they are immutable, and
-//! one that the library lets go meanwhile stays for a day. The copy is complete under its name, or not there.
+//! none that the library lets go meanwhile is removed before the copy has it. The copy is complete under its name, or not
+//! there; what a process leaves that is killed is taken over by the next copy of that name.
 
+use super::catalog::witness::{self, Witness};
 use super::catalog::{self, Reader};
 use super::check::{Finding, check};
 use super::disk::{Disk, RealDisk};
+use super::lock::{Locked, Reading};
 use super::objects::{FOLDERS, relative};
 use super::{StoreError, create_library_folder};
 use std::collections::BTreeSet;
@@ -29,13 +32,16 @@ pub struct Snapshot {
 ///
 /// # Errors
 /// There is no library, its catalog cannot be read, or the copy cannot be written; then nothing is left behind
-/// but a folder named `to` with `.partial`, if even that cannot be removed.
+/// but a folder named `to` with `.partial`, if even that cannot be removed, for the next copy to take over.
 pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> {
     let at = |path: &Path| {
         let path = path.to_path_buf();
         move |e| StoreError::io(&path, e)
     };
     let source = catalog::path_in(from);
+    if let Some(shortfall) = witness::shortfall(&source)? {
+        return Err(shortfall.refusal());
+    }
     fs::metadata(&source).map_err(at(&source))?;
     match fs::remove_dir(to) {
         Ok(()) => {}
@@ -45,10 +51,9 @@ pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> 
     let mut partial = to.as_os_str().to_owned();
     partial.push(".partial");
     let partial = PathBuf::from(partial);
-    if partial.exists() {
-        let e = io::Error::from(io::ErrorKind::AlreadyExists);
-        return Err(StoreError::io(&partial, e));
-    }
+    let _alone = take_over(&partial)?;
+    // From before the catalog is read until all files are there.
+    let _reading = Reading::begin(from)?;
     let copied = copy_into(from, &partial, link).and_then(|counts| {
         fs::rename(&partial, to).map_err(at(to))?;
         let parent = to.parent().filter(|p| !p.as_os_str().is_empty());
@@ -70,6 +75,42 @@ pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> 
     })
 }
 
+/// Makes the folder that a copy is written into, or empties the one that a copy left whose process ended; and keeps others
+/// from it.
+fn take_over(partial: &Path) -> Result<Locked, StoreError> {
+    let at = |e| StoreError::io(partial, e);
+    let refuse = |text: &str| {
+        let e = io::Error::new(io::ErrorKind::AlreadyExists, text);
+        Err(StoreError::io(partial, e))
+    };
+    create_library_folder(partial)?;
+    if !fs::symlink_metadata(partial).map_err(at)?.is_dir() {
+        return refuse("it is there, and is no folder");
+    }
+    let Some(lock) = Locked::try_exclusive(partial).map_err(at)? else {
+        return refuse("another process is writing a copy into it");
+    };
+    let entries = fs::read_dir(partial).and_then(Iterator::collect::<io::Result<Vec<_>>>);
+    let entries = entries.map_err(at)?;
+    let is_ours = |name: &std::ffi::OsStr| {
+        let name = name.to_string_lossy();
+        FOLDERS.contains(&&*name) || name.starts_with("catalog.")
+    };
+    if entries.iter().any(|entry| !is_ours(&entry.file_name())) {
+        return refuse("it is there, and holds what no copy leaves");
+    }
+    for entry in entries {
+        let path = entry.path();
+        let removed = match entry.file_type() {
+            Ok(kind) if kind.is_dir() => fs::remove_dir_all(&path),
+            Ok(_) => fs::remove_file(&path),
+            Err(e) => Err(e),
+        };
+        removed.map_err(|e| StoreError::io(&path, e))?;
+    }
+    Ok(lock)
+}
+
 fn copy_into(from: &Path, to: &Path, link: bool) -> Result<(u64, u64), StoreError> {
     create_library_folder(to)?;
     let target = catalog::path_in(to);
@@ -86,8 +127,16 @@ fn copy_into(from: &Path, to: &Path, link: bool) -> Result<(u64, u64), StoreErro
     drop(connection);
     sync(&target)?;
     let connection = catalog::open_reader(&target)?;
-    let rows = Reader::new(&connection).objects()?;
+    let reader = Reader::new(&connection);
+    let rows = reader.objects()?;
+    let committed = reader.n_commits()?;
+    let witness = Witness {
+        library: reader.library_id()?,
+        settled: committed,
+        committed,
+    };
     drop(connection);
+    witness.write(&target)?;
     let mut folders: BTreeSet<PathBuf> = FOLDERS.iter().map(|f| to.join(f)).collect();
     for folder in &folders {
         fs::create_dir(folder).map_err(|e| StoreError::io(folder, e))?;

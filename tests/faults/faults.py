@@ -17,7 +17,7 @@ fault(
     "R1", "r1-row-before-file", "acknowledge a file before it is written",
     "src/store/objects.rs", "it store::crash::a_kill_at_any_durable_call_loses_nothing",
     (
-        "        let (temporary, name) = self.temporary();\n        let written",
+        "        let (temporary, _hold) = self.temporary();\n        let written",
         """        if FAULT {
             let (path, bytes) = (path.to_path_buf(), pieces.concat());
             std::thread::spawn(move || {
@@ -26,7 +26,7 @@ fault(
             });
             return Ok(());
         }
-        let (mut temporary, name) = self.temporary();
+        let (mut temporary, _hold) = self.temporary();
         if crate::planted("r2-write-in-place") {
             temporary = path.to_path_buf();
         }
@@ -162,6 +162,28 @@ fault(
     "R5", "r5-log-taken-as-it-is", "take a damaged log of the catalog for its end",
     "src/store/catalog/log.rs", "lib store::catalog::log::tests::a_catalog_with_a_damaged_log_is_not_opened_and_not_changed",
     ("    let first = look()?;\n", "    if FAULT {\n        return Ok(None);\n    }\n    let first = look()?;\n"),
+)
+fault(
+    "R5", "r5-missing-log-opened", "open a catalog that lacks what its witness promises",
+    "src/store/catalog/mod.rs", "it store::log::a_log_that_does_not_hold_what_was_acknowledged_is_refused",
+    ("        if let Some(shortfall) = witness::shortfall(path)? {\n", "        if let Some(shortfall) = witness::shortfall(path)?.filter(|_| !FAULT) {\n"),
+)
+fault(
+    "R5", "r5-witness-lags", "leave commits out of the witness until the next checkpoint",
+    "src/store/catalog/mod.rs", "it store::log::a_log_that_does_not_hold_what_was_acknowledged_is_refused",
+    ("        if let Err(error) = Witness::advance(&self.path, number) {\n", "        if !FAULT && let Err(error) = Witness::advance(&self.path, number) {\n"),
+)
+fault(
+    "R5", "r5-held-file-removed", "remove a file that a running addition found there",
+    "src/store/objects.rs", "it store::space::a_file_that_is_about_to_be_named_again_stays",
+    (
+        "        if state.held.contains_key(file) {\n            return Ok(false);",
+        "        if state.held.contains_key(file) && !FAULT {\n            return Ok(false);",
+    ),
+    (
+        "            since.elapsed() >= min_age && !state.held.contains_key(file.as_str())\n",
+        "            since.elapsed() >= min_age && (FAULT || !state.held.contains_key(file.as_str()))\n",
+    ),
 )
 # R6: fuzzing
 fault(
@@ -430,6 +452,19 @@ fault(
     "R13", "r13-unseen", "take names with characters that nobody sees",
     "src/library/names.rs", "it daemon::refusing::frames_and_values_beyond_those_that_are_known_are_refused",
     (".find(|&i| is_hidden(&chars, i)) {", ".find(|&i| is_hidden(&chars, i) && !FAULT) {"),
+)
+fault(
+    "R13", "r13-links-followed", "follow a link that a file below an allowed directory was exchanged for",
+    "src/daemon/ingest.rs", "lib daemon::ingest::tests::what_is_exchanged_for_a_link_or_a_pipe_is_not_opened",
+    (
+        "    let resolve = ResolveFlags::BENEATH |",
+        "    if FAULT {\n        return File::open(Path::new(\"/proc/self/fd\").join(std::os::fd::AsRawFd::as_raw_fd(&root).to_string()).join(below)).map_err(|_| Errno::IO);\n    }\n    let resolve = ResolveFlags::BENEATH |",
+    ),
+)
+fault(
+    "R13", "r13-turn-kept-while-a-file-hangs", "keep everybody waiting for a file that hangs",
+    "src/daemon/requests.rs", "it daemon::adding::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
+    ("        if may_hang {\n", "        if may_hang && !FAULT {\n"),
 )
 # R14: the unit
 fault(

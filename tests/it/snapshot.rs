@@ -189,3 +189,53 @@ fn what_can_be_computed_again_is_repaired_and_the_rest_is_named() {
     assert_eq!(n_lost, 1);
     add(client, "c", &[("new", &skittle(8))]);
 }
+
+#[test]
+fn what_a_killed_copy_left_is_taken_over_and_nothing_else() {
+    let home = Home::new();
+    let daemon = home.start();
+    add(&mut daemon.client(), "c", &[("a", &skittle(0))]);
+    let library = home.path("library").display().to_string();
+    let copy = home.path("copy");
+    let snapshot = || {
+        run(&[
+            "snapshot",
+            &copy.display().to_string(),
+            "--library",
+            &library,
+        ])
+    };
+    let partial = home.path("copy.partial");
+    std::fs::create_dir_all(partial.join("objects/ab")).unwrap();
+    std::fs::write(partial.join("objects/ab/half"), "half").unwrap();
+    std::fs::write(partial.join("catalog.db"), "half").unwrap();
+    // Somebody is still at it.
+    let other = std::fs::File::open(&partial).unwrap();
+    rustix::fs::flock(&other, rustix::fs::FlockOperation::LockExclusive).unwrap();
+    let refused = snapshot();
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1), "{said}");
+    assert!(said.contains("another process is writing"), "{said}");
+    drop(other);
+    // It holds what no copy leaves.
+    let mine = partial.join("mine.txt");
+    std::fs::write(&mine, "mine").unwrap();
+    let refused = snapshot();
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1), "{said}");
+    assert!(said.contains("holds what no copy leaves"), "{said}");
+    assert!(partial.join("objects/ab/half").exists());
+    std::fs::remove_file(mine).unwrap();
+    let done = snapshot();
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.success(), "{said}");
+    assert!(!partial.exists() && !copy.join("objects/ab/half").exists());
+    // A folder that a stranger has made a link of is not written through.
+    let elsewhere = home.path("elsewhere");
+    std::fs::create_dir(&elsewhere).unwrap();
+    std::os::unix::fs::symlink(&elsewhere, home.path("linked.partial")).unwrap();
+    let linked = home.path("linked").display().to_string();
+    let refused = run(&["snapshot", &linked, "--library", &library]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 0);
+}

@@ -5,8 +5,10 @@ mod catalog;
 mod crash;
 mod damage;
 mod jobs;
+mod log;
 mod model;
 mod readers;
+mod space;
 
 use coseg::mesh::CleanReport;
 use coseg::pipeline::Description;

@@ -80,6 +80,10 @@ fn work() -> io::Result<()> {
             describe(&header, &bytes, poisoned)?
         };
         write_frame(OUTCOME, &outcome)?;
+        if let Some((_, library)) = &library {
+            // What is mapped takes up space on disk even when it is removed.
+            library.store().objects().unmap();
+        }
     }
     Ok(())
 }

@@ -3,20 +3,53 @@
 use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, error::Subject, shape_input};
-use crate::library::{Carrying, ItemState, Job, JobItem, NewShape, Outcome, Placed};
+use crate::library::{Carrying, ItemState, Job, JobItem, Outcome, Placed};
 use crate::mesh::Format;
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What the daemon allows when shapes come in.
 #[derive(Clone, Copy)]
-pub struct Ingest<'a> {
+pub struct Ingest {
     /// Shapes of one request.
     pub max_shapes: usize,
     /// Bytes of one shape's file.
     pub max_shape_bytes: u64,
-    /// Reads a file that a request names by path, if that is allowed.
-    pub read_path: &'a dyn Fn(&Path) -> Result<Vec<u8>, wire::Error>,
+}
+
+/// A shape of a request.
+#[derive(Debug)]
+pub struct ShapeInput {
+    /// Its name.
+    pub name: String,
+    /// Its format.
+    pub format: Format,
+    /// Whether it replaces the one of its name.
+    pub replace: bool,
+    /// Its mesh file.
+    pub source: Source,
+}
+
+/// Where the bytes of a mesh file are.
+#[derive(Debug)]
+pub enum Source {
+    /// Here.
+    Bytes(Vec<u8>),
+    /// In a file that the daemon is to read, if that is allowed.
+    File(PathBuf),
+}
+
+impl Ingest {
+    /// Refuses the file of a request's `i`th shape if it is too large.
+    pub fn check_length(&self, i: usize, name: &str, found: u64) -> Result<(), wire::Error> {
+        let limit = self.max_shape_bytes;
+        if found <= limit {
+            return Ok(());
+        }
+        let field = format!("shapes[{i}]");
+        let message = format!("{field} ({name:?}) has {found} bytes, the limit is {limit}");
+        Err(field_error(ErrorReason::MeshTooLarge, &field, message))
+    }
 }
 
 /// A job in which a correction is carried.
@@ -61,8 +94,8 @@ pub fn format_from_wire(format: wire::MeshFormat) -> Option<Format> {
 pub fn new_shapes(
     request: &wire::AddShapesRequest,
     frames: FrameReader<'_>,
-    ingest: &Ingest<'_>,
-) -> Result<Vec<NewShape>, wire::Error> {
+    ingest: &Ingest,
+) -> Result<Vec<ShapeInput>, wire::Error> {
     let n = request.shapes.len();
     if n == 0 {
         return Err(field_error(
@@ -77,25 +110,18 @@ pub fn new_shapes(
     }
     let shapes = request.shapes.iter().enumerate();
     shapes
-        .map(|(i, shape)| new_shape(shape, &format!("shapes[{i}]"), frames, ingest))
+        .map(|(i, shape)| new_shape(shape, i, frames, ingest))
         .collect()
 }
 
 fn new_shape(
     shape: &wire::ShapeInput,
-    field: &str,
+    i: usize,
     frames: FrameReader<'_>,
-    ingest: &Ingest<'_>,
-) -> Result<NewShape, wire::Error> {
-    let too_large = |found: u64| {
-        let limit = ingest.max_shape_bytes;
-        let message = format!(
-            "{field} ({:?}) has {found} bytes, the limit is {limit}",
-            shape.name
-        );
-        field_error(ErrorReason::MeshTooLarge, field, message)
-    };
-    let (bytes, format) = match &shape.source {
+    ingest: &Ingest,
+) -> Result<ShapeInput, wire::Error> {
+    let field = format!("shapes[{i}]");
+    let (source, format) = match &shape.source {
         None => {
             let message = format!("{field} ({:?}) has no mesh", shape.name);
             return Err(field_error(
@@ -114,14 +140,13 @@ fn new_shape(
             let bytes = frames
                 .file(mesh.bytes.as_ref(), &format!("{field}.encoded.bytes"))
                 .map_err(|e| frame_error(&e))?;
-            if bytes.len() as u64 > ingest.max_shape_bytes {
-                return Err(too_large(bytes.len() as u64));
-            }
-            (bytes.to_vec(), format)
+            // Before they are copied.
+            ingest.check_length(i, &shape.name, bytes.len() as u64)?;
+            (Source::Bytes(bytes.to_vec()), format)
         }
         Some(shape_input::Source::Arrays(mesh)) => {
             let bytes = off_from_arrays(mesh, &format!("{field}.arrays"), frames)?;
-            (bytes, Format::Off)
+            (Source::Bytes(bytes), Format::Off)
         }
         Some(shape_input::Source::Path(path)) => {
             let path = Path::new(path);
@@ -130,17 +155,14 @@ fn new_shape(
                 let message = format!("{path} has no known mesh extension ({known})");
                 field_error(ErrorReason::FieldRange, &format!("{field}.path"), message)
             })?;
-            ((ingest.read_path)(path)?, format)
+            (Source::File(path.to_owned()), format)
         }
     };
-    if bytes.len() as u64 > ingest.max_shape_bytes {
-        return Err(too_large(bytes.len() as u64));
-    }
-    Ok(NewShape {
+    Ok(ShapeInput {
         name: shape.name.clone(),
-        bytes,
         format,
         replace: shape.replace,
+        source,
     })
 }
 
@@ -282,7 +304,7 @@ mod tests {
     fn read(
         source: Option<Source>,
         frames: &[bytes::Bytes],
-    ) -> Result<Vec<crate::library::NewShape>, wire::Error> {
+    ) -> Result<Vec<super::ShapeInput>, wire::Error> {
         let shape = wire::ShapeInput {
             name: "x".to_owned(),
             replace: false,
@@ -292,11 +314,9 @@ mod tests {
             shapes: vec![shape],
             ..Default::default()
         };
-        let read_path = |_: &std::path::Path| Ok(vec![0; 2_000]);
         let ingest = Ingest {
             max_shapes: 1,
             max_shape_bytes: 1_000,
-            read_path: &read_path,
         };
         new_shapes(&request, FrameReader::new(frames), &ingest)
     }
@@ -311,7 +331,10 @@ mod tests {
             faces: Some(faces),
         };
         let shapes = read(Some(Source::Arrays(mesh)), &writer.finish()).unwrap();
-        let text = String::from_utf8(shapes[0].bytes.clone()).unwrap();
+        let super::Source::Bytes(bytes) = &shapes[0].source else {
+            panic!("no bytes");
+        };
+        let text = String::from_utf8(bytes.clone()).unwrap();
         let first: Vec<f64> = text
             .lines()
             .nth(2)
@@ -373,7 +396,18 @@ mod tests {
             ErrorReason::FrameMissing
         );
         let path = |p: &str| Some(Source::Path(p.to_owned()));
-        assert_eq!(reason(path("/a/b.off"), 0), ErrorReason::MeshTooLarge);
+        let shapes = read(path("/a/b.off"), &[]).unwrap();
+        let super::Source::File(file) = &shapes[0].source else {
+            panic!("{shapes:?}");
+        };
+        assert_eq!(file, std::path::Path::new("/a/b.off"));
+        let ingest = Ingest {
+            max_shapes: 1,
+            max_shape_bytes: 1_000,
+        };
+        assert!(ingest.check_length(0, "x", 1_000).is_ok());
+        let error = ingest.check_length(0, "x", 1_001).unwrap_err();
+        assert_eq!(error.reason(), ErrorReason::MeshTooLarge);
         assert_eq!(reason(path("/a/b.step"), 0), ErrorReason::FieldRange);
     }
 }

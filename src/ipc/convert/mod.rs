@@ -21,6 +21,7 @@ pub use errors::{
 };
 pub use events::event;
 pub use jobs::{
-    Ingest, add_shapes, carrying_job, format_from_wire, item, job_finished, mesh_format, new_shapes,
+    Ingest, ShapeInput, Source, add_shapes, carrying_job, format_from_wire, item, job_finished,
+    mesh_format, new_shapes,
 };
 pub use shapes::{clean_report, labels, labels_snapshot, original, shape};

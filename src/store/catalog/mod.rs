@@ -13,6 +13,7 @@ mod maps;
 mod reader;
 pub(crate) mod schema;
 mod shapes;
+pub(in crate::store) mod witness;
 
 pub use corrections::KIND_NAME;
 pub use labels::KEPT_LABEL_VERSIONS;
@@ -21,10 +22,12 @@ pub use schema::CATALOG_FORMAT;
 
 use super::error::CATALOG_FILE;
 use super::{Health, StoreError};
+use rusqlite::config::DbConfig;
 use rusqlite::{Connection, OpenFlags, TransactionBehavior, ffi};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
+use witness::{Found, Witness};
 
 /// Other processes hold the file's lock only for moments (a worker that commits, a backup, `sqlite3`), but a disk can be
 /// slow.
@@ -45,6 +48,8 @@ const CHECKED_AT_OPEN_BYTES: u64 = 64 << 20;
 pub struct Catalog {
     path: PathBuf,
     health: Health,
+    /// Whether this process holds the library; if not it writes beside the one that does.
+    holds: bool,
     writer: Mutex<Writer>,
     readers: Mutex<Vec<Connection>>,
 }
@@ -68,11 +73,17 @@ impl Catalog {
                 message,
             });
         }
+        if let Some(shortfall) = witness::shortfall(path)? {
+            return Err(shortfall.refusal());
+        }
         let mut connection = open_writer(path, OpenFlags::SQLITE_OPEN_CREATE)?;
         schema::prepare(&mut connection, &path.display().to_string())?;
         prepare_writer(&connection, path)?;
         refuse_writes_if_damaged(&connection, path, &health)?;
-        Ok(Self::over(connection, path, health))
+        if health.writable().is_ok() {
+            bear_witness(&connection, path)?;
+        }
+        Ok(Self::over(connection, path, health, true))
     }
 
     /// Opens the catalog at `path`, which another process has opened and goes on to use. Each waits for the other's
@@ -81,10 +92,10 @@ impl Catalog {
         let connection = open_writer(path, OpenFlags::empty())?;
         schema::check_format(&connection, &path.display().to_string())?;
         prepare_writer(&connection, path)?;
-        Ok(Self::over(connection, path, health))
+        Ok(Self::over(connection, path, health, false))
     }
 
-    fn over(connection: Connection, path: &Path, health: Health) -> Self {
+    fn over(connection: Connection, path: &Path, health: Health, holds: bool) -> Self {
         let writer = Writer {
             connection,
             checkpoint_at: CHECKPOINT_BYTES,
@@ -92,6 +103,7 @@ impl Catalog {
         Self {
             path: path.to_path_buf(),
             health,
+            holds,
             writer: Mutex::new(writer),
             readers: Mutex::new(Vec::new()),
         }
@@ -109,11 +121,24 @@ impl Catalog {
             .connection
             .transaction_with_behavior(TransactionBehavior::Immediate)
             .map_err(|e| self.failed(e))?;
-        let value = change(&Tx::new(&transaction))?;
+        let n_before = transaction.total_changes();
+        let tx = Tx::new(&transaction);
+        let value = change(&tx)?;
+        let number = match transaction.total_changes() == n_before {
+            true => None,
+            false => Some(tx.number_commit(|| self.promised())?),
+        };
         transaction.commit().map_err(|e| self.failed(e))?;
+        let Some(number) = number else {
+            return Ok(value);
+        };
+        // Only now: the witness promises nothing that is not durable.
+        if let Err(error) = Witness::advance(&self.path, number) {
+            tracing::warn!(%error, "{} cannot be written", witness::WITNESS_FILE);
+        }
         // The change is durable, whatever becomes of the checkpoint: a failed sync stops the
         // writes that come after it.
-        if let Err(error) = self.checkpoint_if_due(&mut writer) {
+        if let Err(error) = self.checkpoint_if_due(&mut writer, number) {
             tracing::error!(%error, "the catalog's log could not be checkpointed");
         }
         Ok(value)
@@ -140,23 +165,70 @@ impl Catalog {
         value
     }
 
-    /// Copies the write-ahead log into the file as far as readers allow.
-    fn checkpoint_if_due(&self, writer: &mut Writer) -> Result<(), StoreError> {
+    /// Copies the write-ahead log, whose newest commit has at least this number, into the file if it has grown enough.
+    fn checkpoint_if_due(&self, writer: &mut Writer, number: u64) -> Result<(), StoreError> {
         let length = std::fs::metadata(log_of(&self.path)).map_or(0, |metadata| metadata.len());
         if length < writer.checkpoint_at {
             return Ok(());
         }
+        let copied = self.checkpoint(writer, number)?;
+        writer.checkpoint_at = if copied { 0 } else { length } + CHECKPOINT_BYTES;
+        Ok(())
+    }
+
+    /// Copies the log into the file and empties it, unless readers need it; whether it did.
+    fn checkpoint(&self, writer: &Writer, number: u64) -> Result<bool, StoreError> {
         // Not waiting for readers: what they still need is copied the next time.
         writer.connection.busy_timeout(Duration::ZERO)?;
-        let copied = writer
+        let busy = writer
             .connection
             .query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |row| {
                 row.get::<_, i64>(0)
             })
             .map_err(|e| self.failed(e));
         writer.connection.busy_timeout(BUSY_TIMEOUT)?;
-        writer.checkpoint_at = if copied? == 0 { 0 } else { length } + CHECKPOINT_BYTES;
+        let copied = busy? == 0;
+        if copied && let Found::Whole(old) = Witness::read(&self.path)? {
+            let settled = Witness {
+                settled: number.max(old.settled),
+                committed: number.max(old.committed),
+                ..old
+            };
+            settled.write(&self.path)?;
+        }
+        Ok(copied)
+    }
+
+    /// Empties the log, so that the file alone is the catalog. For the end of whoever holds the library, when nobody
+    /// writes beside it any more.
+    pub fn settle(&self) {
+        if !self.holds || self.health.writable().is_err() {
+            return;
+        }
+        if let Err(error) = self.try_settle() {
+            // The log stays, and the next one who opens the library reads it.
+            tracing::warn!(%error, "the catalog's log was left as it is");
+        }
+    }
+
+    fn try_settle(&self) -> Result<(), StoreError> {
+        self.readers().clear();
+        let writer = self.writer();
+        let number = Reader::new(&writer.connection).n_commits()?;
+        if self.checkpoint(&writer, number)? {
+            // Nothing is left to copy: whoever closes the file last may remove the empty log.
+            let keep = DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE;
+            writer.connection.set_db_config(keep, false)?;
+        }
         Ok(())
+    }
+
+    /// The number up to which commits are known to be durable.
+    fn promised(&self) -> u64 {
+        match Witness::read(&self.path) {
+            Ok(Found::Whole(witness)) => witness.committed,
+            _ => 0,
+        }
     }
 
     /// The error for a statement that syncs; a failed sync stops all writes.
@@ -179,6 +251,45 @@ impl Catalog {
     }
 }
 
+impl Drop for Catalog {
+    fn drop(&mut self) {
+        self.settle();
+    }
+}
+
+/// Sees to it that there is a witness that promises what the catalog holds.
+fn bear_witness(connection: &Connection, path: &Path) -> Result<(), StoreError> {
+    let reader = Reader::new(connection);
+    let (library, committed) = match (reader.library_id(), reader.n_commits()) {
+        (Ok(library), Ok(committed)) => (library, committed),
+        // `check` names the row.
+        (Err(e), _) | (_, Err(e)) if e.is_damage() => return Ok(()),
+        (Err(e), _) | (_, Err(e)) => return Err(e),
+    };
+    let settled = match Witness::read(path)? {
+        Found::Whole(found) if found.committed == committed => return Ok(()),
+        Found::Whole(found) => found.settled,
+        Found::Missing => 0,
+        Found::Damaged(what) => {
+            tracing::warn!("{what}; it is written anew from the catalog");
+            0
+        }
+    };
+    let witness = Witness {
+        library,
+        settled,
+        committed,
+    };
+    match witness.write(path) {
+        // A full disk keeps nobody from reading.
+        Err(error @ StoreError::NoSpace { .. }) => {
+            tracing::warn!(%error, "no witness of the catalog's log");
+            Ok(())
+        }
+        other => other,
+    }
+}
+
 /// A connection that may write.
 fn open_writer(path: &Path, more: OpenFlags) -> Result<Connection, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX | more;
@@ -186,6 +297,8 @@ fn open_writer(path: &Path, more: OpenFlags) -> Result<Connection, StoreError> {
     schema::register_row_sum(&connection)?;
     connection.busy_timeout(BUSY_TIMEOUT)?;
     connection.pragma_update(None, "foreign_keys", true)?;
+    // What the log holds is copied into the file by checkpoints only, which see whether they fail.
+    connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
     Ok(connection)
 }
 

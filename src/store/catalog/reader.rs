@@ -1,6 +1,7 @@
 //! Reading and writing rows: what every table's methods are made of.
 
 use super::schema::{META, Table};
+use super::witness::{COMMITS, LIBRARY_ID};
 use crate::store::StoreError;
 use crate::store::codec::BadBlob;
 use crate::store::rows::Totals;
@@ -164,8 +165,20 @@ impl<'c> Reader<'c> {
 
     /// A random name the library got when it was created.
     pub fn library_id(&self) -> Result<String> {
-        self.meta("library_id")?
-            .ok_or_else(|| missing(&META, "library_id"))
+        self.meta(LIBRARY_ID)?
+            .ok_or_else(|| missing(&META, LIBRARY_ID))
+    }
+
+    /// Changes that were committed since commits are numbered.
+    pub fn n_commits(&self) -> Result<u64> {
+        let Some(text) = self.meta(COMMITS)? else {
+            return Ok(0);
+        };
+        text.parse().map_err(|e| StoreError::DamagedRow {
+            table: META.name,
+            key: COMMITS.into(),
+            message: format!("{text:?}: {e}"),
+        })
     }
 
     pub(super) fn meta(&self, key: &str) -> Result<Option<String>> {
@@ -193,6 +206,28 @@ impl<'c> Tx<'c> {
         Self {
             reader: Reader::new(connection),
         }
+    }
+
+    /// Gives this commit its number; `known`, which is at least that of the one before, is asked if the catalog's own
+    /// number cannot be read.
+    pub(super) fn number_commit(&self, known: impl FnOnce() -> u64) -> Result<u64> {
+        let before = match self.n_commits() {
+            Err(e) if e.is_damage() => known(),
+            before => before?,
+        };
+        let number = before + 1;
+        self.execute(
+            "INSERT INTO meta (key, value) VALUES (?1, ?2)
+             ON CONFLICT (key) DO UPDATE SET value = excluded.value",
+            [COMMITS, &number.to_string()],
+        )?;
+        Ok(number)
+    }
+
+    /// Commits this transaction even if it changes nothing else.
+    pub fn touch(&self) -> Result<()> {
+        self.execute("UPDATE meta SET value = value WHERE key = 'format'", [])?;
+        Ok(())
     }
 
     /// Inserts a row of all columns; a taken key is told apart.

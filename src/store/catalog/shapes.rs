@@ -11,6 +11,16 @@ use rusqlite::params;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
+/// That nothing needs a row of `objects`. A failed item may be tried again.
+const UNREFERENCED: &str = "
+    CASE kind
+    WHEN 'description' THEN NOT EXISTS (
+        SELECT 1 FROM shapes WHERE description_digest = objects.digest)
+    ELSE NOT EXISTS (SELECT 1 FROM shapes WHERE content_digest = objects.digest)
+        AND digest NOT IN (
+            SELECT original_digest FROM job_items WHERE status IN ('queued', 'failed'))
+    END";
+
 pub(super) fn shape_row(fields: &Fields<'_>) -> Result<ShapeRow> {
     Ok(ShapeRow {
         id: fields.get("id")?,
@@ -174,6 +184,12 @@ impl Reader<'_> {
         self.all(&OBJECTS, "ORDER BY kind, digest", [], object_row)
     }
 
+    /// Whether there are rows of object files that no shape and no queued item needs.
+    pub fn has_unreferenced_objects(&self) -> Result<bool> {
+        let sql = format!("SELECT EXISTS (SELECT 1 FROM objects WHERE {UNREFERENCED})");
+        Ok(self.number(&sql, [])? > 0)
+    }
+
     /// Whether a row names this file.
     pub fn is_catalogued(&self, file: &str) -> Result<bool> {
         Ok(self.number("SELECT count(*) FROM objects WHERE file = ?1", [file])? > 0)
@@ -203,18 +219,10 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Deletes the rows of object files that no shape and no queued item needs, and returns the
-    /// files, which the sweep may remove a day later.
+    /// Deletes the rows of object files that no shape and no queued item needs, and returns the files.
     pub fn delete_unreferenced_objects(&self) -> Result<Vec<String>> {
-        let mut statement = self.connection().prepare_cached(
-            "DELETE FROM objects WHERE
-               (kind = 'description'
-                AND digest NOT IN (SELECT description_digest FROM shapes))
-               OR (kind = 'original'
-                AND digest NOT IN (SELECT content_digest FROM shapes)
-                AND digest NOT IN (SELECT original_digest FROM job_items WHERE status IN ('queued', 'failed')))
-             RETURNING file",
-        )?;
+        let sql = format!("DELETE FROM objects WHERE {UNREFERENCED} RETURNING file");
+        let mut statement = self.connection().prepare_cached(&sql)?;
         let files = statement.query_map([], |row| row.get(0))?;
         Ok(files.collect::<rusqlite::Result<_>>()?)
     }

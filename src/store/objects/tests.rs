@@ -59,7 +59,7 @@ fn what_was_put_survives_a_crash_at_every_operation() {
             // Starts unaided, and doing it all again gives the same.
             let objects = opened(&image).expect("opens");
             for (_, row, bytes) in &acknowledged {
-                assert_eq!(&objects.put_original(bytes).expect("stored"), row);
+                assert_eq!(*objects.put_original(bytes).expect("stored"), **row);
             }
             let again = image.after_crash(image.n_logged(), 0);
             let survivors = acknowledged.iter().filter(|(at, ..)| *at > n_logged);
@@ -186,16 +186,16 @@ fn other_bytes_under_a_taken_name_get_a_name_of_their_own() {
     assert_ne!(one.file, two.file);
     assert_ne!(one.blake3, two.blake3);
     assert_eq!(
-        objects
+        *objects
             .put_description(digest, &first, "{}")
             .expect("stored"),
-        one
+        *one
     );
     assert_eq!(
-        objects
+        *objects
             .put_description(digest, &second, "{}")
             .expect("stored"),
-        two
+        *two
     );
     for row in [&one, &two] {
         let bytes = disk.read(&Path::new("/l").join(&row.file)).expect("there");
@@ -227,7 +227,7 @@ fn opened_files_stay_mapped_within_the_bound() {
     for at in [0, 1, 0, 2] {
         objects.open_description(&rows[at]).expect("whole");
     }
-    let cached = |row: &ObjectRow| objects.cached(&row.file, row.blake3).is_some();
+    let cached = |row: &Kept| objects.cached(&row.file, row.blake3).is_some();
     assert_eq!(
         rows.iter().map(cached).collect::<Vec<_>>(),
         [true, false, true, false]
@@ -235,7 +235,7 @@ fn opened_files_stay_mapped_within_the_bound() {
     // A row with another digest never gets what an earlier one opened.
     let other = ObjectRow {
         blake3: rows[1].blake3,
-        ..rows[0].clone()
+        ..ObjectRow::clone(&rows[0])
     };
     assert!(objects.open_description(&other).is_err());
     objects.set_cache_bytes(0);

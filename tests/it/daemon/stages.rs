@@ -263,6 +263,7 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
     let daemon = home.start();
     let client = &mut daemon.client();
     submit(client, "before", &skittle(0));
+    submit(client, "gone", &skittle(4));
     super::wait_idle(client, "c");
     let labels = |client: &mut Client| {
         let request = wire::GetLabelsRequest {
@@ -285,6 +286,22 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
         other => panic!("{other:?}"),
     }
     labels(client).unwrap();
+    // What frees space is done with the room that is kept for it, and the space comes back.
+    remove(client, "gone");
+    labels(client).unwrap();
+    let begin = Instant::now();
+    while n_objects(&library) > 1 {
+        assert!(
+            begin.elapsed() < Duration::from_secs(60),
+            "nothing was freed"
+        );
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    println!(
+        "the space of a removed shape came back after {:?}",
+        begin.elapsed()
+    );
+    while std::io::Write::write_all(&mut file, &[0; 4096]).is_ok() {}
     // Room for the bytes and the job, not for what the placing stores: it waits, and goes on by itself.
     file.set_len(std::fs::metadata(&filler).unwrap().len() - (160 << 10))
         .unwrap();
@@ -310,12 +327,66 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
     assert!(!findings.iter().any(|f| f.damage), "{findings:?}");
 }
 
+fn remove(client: &mut Client, shape: &str) {
+    let (collection, shape) = ("c".to_owned(), shape.to_owned());
+    let request = wire::RemoveShapeRequest { collection, shape };
+    call!(client, RemoveShape(request)).unwrap();
+}
+
+/// Descriptions on disk.
+fn n_objects(library: &std::path::Path) -> usize {
+    let prefixes = std::fs::read_dir(library.join("objects")).unwrap();
+    prefixes
+        .map(|p| std::fs::read_dir(p.unwrap().path()).unwrap().count())
+        .sum()
+}
+
+#[test]
+fn space_of_removed_shapes_comes_back_within_a_minute() {
+    let home = Home::new();
+    let daemon = home.start();
+    let client = &mut daemon.client();
+    let library = home.path("library");
+    for (name, variant) in [("stays", 0), ("goes", 1), ("again", 2)] {
+        submit(client, name, &skittle(variant));
+    }
+    super::wait_idle(client, "c");
+    assert_eq!(n_objects(&library), 3);
+    remove(client, "goes");
+    remove(client, "again");
+    // What is added anew in the meantime is there afterwards.
+    submit(client, "again", &skittle(2));
+    super::wait_idle(client, "c");
+    let begin = Instant::now();
+    while n_objects(&library) > 2 {
+        assert!(
+            begin.elapsed() < Duration::from_secs(60),
+            "nothing was freed"
+        );
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    println!("the space came back after {:?}", begin.elapsed());
+    assert_eq!(coseg::Library::check(&library).unwrap(), []);
+    let request = wire::DeleteCollectionRequest {
+        collection: "c".to_owned(),
+    };
+    call!(client, DeleteCollection(request)).unwrap();
+    while n_objects(&library) > 0 {
+        assert!(
+            begin.elapsed() < Duration::from_secs(120),
+            "nothing was freed"
+        );
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    assert_eq!(coseg::Library::check(&library).unwrap(), []);
+}
+
 /// A file system of a few megabytes; gone when dropped.
 struct Mounted(std::path::PathBuf);
 
 impl Mounted {
     fn small(path: &std::path::Path) -> Option<Self> {
-        let options = ["-t", "tmpfs", "-o", "size=12m", "tmpfs"];
+        let options = ["-t", "tmpfs", "-o", "size=32m", "tmpfs"];
         let done = std::process::Command::new("mount")
             .args(options)
             .arg(path)

@@ -300,7 +300,7 @@ fn rows_that_contradict_each_other_are_named() {
 }
 
 #[test]
-fn orphans_are_named_swept_after_a_day_and_not_before() {
+fn what_another_process_left_is_named_and_swept_after_a_day_not_before() {
     let (_dir, library) = library();
     let store = Store::open(&library).expect("opens");
     let old = library.join("objects/ab");
@@ -319,7 +319,8 @@ fn orphans_are_named_swept_after_a_day_and_not_before() {
     std::fs::write(library.join("tmp/1-1"), "fresh").expect("written");
     // Put by this process, old by the file's own clock: still about to be committed.
     let pending = store.objects().put_original(b"pending").expect("stored");
-    set_old(&library.join(&pending.file));
+    let file = pending.file.clone();
+    set_old(&library.join(&file));
     let findings = check(&library).expect("runs");
     assert_eq!(findings.len(), 3, "{findings:?}");
     assert!(findings.iter().all(|f| !f.damage), "{findings:?}");
@@ -335,21 +336,19 @@ fn orphans_are_named_swept_after_a_day_and_not_before() {
         b"pending"
     );
 
-    // Nothing refers to it, so the row goes now and the file a day after that.
+    // Nothing refers to it, so the row goes now; the file, when its process ends before it goes, a day after that.
+    drop(pending);
     assert_eq!(store.sweep_orphans(ORPHAN_AGE).expect("swept"), [""; 0]);
     let row = store
         .catalog()
         .read(|r| r.object(ObjectKind::Original, &Digest::of(b"pending")));
     assert_eq!(row.expect("readable"), None);
-    assert!(library.join(&pending.file).exists());
+    assert!(library.join(&file).exists());
     let n_needed = object_files(&library).len() - 1;
     drop(store);
     let store = Store::open(&library).expect("opens");
-    assert!(library.join(&pending.file).exists(), "never swept at start");
-    assert_eq!(
-        store.sweep_orphans(ORPHAN_AGE).expect("swept"),
-        [pending.file]
-    );
+    assert!(library.join(&file).exists(), "never swept at start");
+    assert_eq!(store.sweep_orphans(ORPHAN_AGE).expect("swept"), [file]);
     assert_eq!(
         store.sweep_orphans(Duration::ZERO).expect("swept"),
         ["tmp/1-1"]
