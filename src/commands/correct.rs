@@ -14,7 +14,7 @@ use std::path::Path;
 pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
     let mut frames = FrameWriter::default();
-    let correction = match (&args.labels, args.part, args.label) {
+    let correction = match (&args.labels, args.part, &args.label) {
         (Some(path), ..) => {
             let labels = read(path)?;
             let request = wire::GetShapeRequest {
@@ -33,7 +33,10 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             }
             Correction::Labels(frames.i32_array(&labels, &[labels.len()]))
         }
-        (None, Some(part), Some(label)) => Correction::Part(wire::LabelledPart { part, label }),
+        (None, Some(part), Some(label)) => {
+            let label = session.label(&collection, label)?;
+            Correction::Part(wire::LabelledPart { part, label })
+        }
         (None, ..) => unreachable!("invariant: clap requires a file, or part and label"),
     };
     let request = wire::CorrectLabelsRequest {

@@ -12,6 +12,7 @@ mod check;
 mod collections;
 mod completions;
 mod config;
+mod confirm;
 mod correct;
 pub(crate) mod demo;
 mod demo_ply;
@@ -20,6 +21,7 @@ mod describe_full;
 mod events;
 mod export;
 mod export_mesh;
+mod interrupt;
 mod jobs;
 mod keys;
 mod labels;
@@ -27,6 +29,7 @@ mod ls;
 mod man;
 mod map;
 mod merge;
+mod mesh_files;
 mod name;
 mod nearest;
 mod render;
@@ -135,7 +138,7 @@ impl CommandError {
         };
         Some(match refusal.reason() {
             ErrorReason::NoCollection => "`coseg ls` lists the collections",
-            ErrorReason::NoShape => "`coseg ls --collection NAME` lists the shapes",
+            ErrorReason::NoShape => "`coseg ls NAME` lists the shapes of a collection",
             ErrorReason::NoLabel | ErrorReason::LabelMerged => {
                 "`coseg show --collection NAME` lists the labels"
             }
@@ -145,7 +148,6 @@ impl CommandError {
                 "look at the daemon's log, then run `coseg check`"
             }
             ErrorReason::NoSpace => "make room on the disk of the library; nothing was lost",
-            ErrorReason::MeshTooLarge => "`coseg config show` has limits.max_shape",
             _ => return None,
         })
     }
@@ -202,6 +204,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Bench(args) => bench::run(args, &cli.global),
         Command::Jobs(args) => jobs::jobs(args, session()?),
         Command::Retry(args) => jobs::retry(args, session()?),
+        Command::Cancel(args) => jobs::cancel(args, session()?),
         Command::Keys(args) => keys::run(args, &cli.global),
         Command::Worker => return Ok(coseg::daemon::run_worker()),
         Command::View(args) => view::run(args, session()?),
@@ -209,7 +212,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Top(args) => top::run(args, session()?),
         Command::Completions { shell } => completions::run(*shell),
         Command::Man { out } => man::run(out.as_deref()),
-        Command::Stop => stop::run(session()?),
+        Command::Stop(args) => stop::run(args, session()?),
     }?;
     Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))
 }

@@ -10,6 +10,7 @@ use crate::daemon::writes::{Done, may_change, refuse};
 use crate::daemon::{Daemon, blocking};
 use crate::ipc::convert;
 use crate::ipc::frames::FrameReader;
+use crate::ipc::size::in_words;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply};
 use crate::library::{Job, KeptShapes, LibraryError, RequestKey, Submission};
 use bytes::Bytes;
@@ -272,25 +273,37 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
     let max_secs = limits.max_queued_seconds as f64;
     let max_shapes = limits.max_queued_shapes as f64;
     let max_bytes = limits.max_queued_bytes.0 as f64;
-    for (what, asked, queued, limit) in [
-        ("shapes", n as f64, load.n_shapes as f64, max_shapes),
-        ("bytes", bytes as f64, load.n_bytes as f64, max_bytes),
+    let bytes_in_words = |n: f64| in_words(n as u64);
+    let seconds_in_words = |n: f64| format!("{n} seconds of work");
+    let shapes_in_words = |n: f64| format!("{n} shapes");
+    let words: [(&str, &dyn Fn(f64) -> String); 3] = [
+        ("limits.max_queued_shapes", &shapes_in_words),
+        ("limits.max_queued_bytes", &bytes_in_words),
+        ("limits.max_queued_seconds", &seconds_in_words),
+    ];
+    for ((key, words), asked, queued, limit) in [
+        (words[0], n as f64, load.n_shapes as f64, max_shapes),
+        (words[1], bytes as f64, load.n_bytes as f64, max_bytes),
         // An estimate alone refuses nothing for good: an empty queue takes whatever it says.
         (
-            "seconds of work",
+            words[2],
             secs.ceil().min(max_secs),
             load.seconds().floor(),
             max_secs,
         ),
     ] {
         if asked > limit {
-            let text = format!("the request has {asked} {what}, the whole queue holds {limit}");
+            let (asked, limit) = (words(asked), words(limit));
+            let text = format!("the request has {asked}, the whole queue holds {limit} ({key})");
             let code = ErrorCode::InvalidArgument;
             return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
         }
         if queued + asked > limit {
+            let [queued_in_words, asked_in_words, limit_in_words] =
+                [queued, asked, limit].map(words);
             let text = format!(
-                "{queued} {what} are queued and {asked} more asked for, the limit is {limit}"
+                "{queued_in_words} are queued and {asked_in_words} more asked for, the limit is \
+                 {limit_in_words} ({key})"
             );
             let code = ErrorCode::ResourceExhausted;
             let mut error = convert::error(code, ErrorReason::QueueFull, text);

@@ -1,9 +1,10 @@
 //! Endpoint URIs become checked addresses: where the daemon listens and where clients find it.
 
+use super::folder::{DefaultFolder, private_directory};
 use std::fmt;
 use std::fs;
+use std::io::Write as _;
 use std::net::IpAddr;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 /// Bytes of the path of a Unix socket, as the kernel's `sockaddr_un` has it, less the final NUL.
@@ -30,10 +31,12 @@ pub enum EndpointError {
          them only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
     )]
     NotLoopback { uri: String },
-    #[error("{path}: {message}")]
+    #[error("{path} {message}")]
     Directory { path: String, message: String },
-    #[error("{path} is in use by a running daemon")]
-    InUse { path: String },
+    #[error(
+        "{path} is in use by a running daemon{holder}; `coseg stop --endpoint ipc://{path}` ends it"
+    )]
+    InUse { path: String, holder: String },
     #[error("{path} exists and is not a socket")]
     NotASocket { path: String },
     #[error("{path}: {source}")]
@@ -127,17 +130,14 @@ impl Endpoint {
     /// `$RUNTIME_DIRECTORY/coseg.sock` under a service manager, else
     /// `$XDG_RUNTIME_DIR/coseg/coseg.sock`, else `/tmp/coseg-UID/coseg.sock`.
     pub fn default_for_user() -> Self {
-        let variable = |name| {
-            std::env::var_os(name)
-                .filter(|v| !v.is_empty())
-                .map(PathBuf::from)
-        };
-        let directory = variable("RUNTIME_DIRECTORY")
-            .or_else(|| variable("XDG_RUNTIME_DIR").map(|d| d.join("coseg")))
-            .unwrap_or_else(|| {
-                PathBuf::from(format!("/tmp/coseg-{}", rustix::process::getuid().as_raw()))
-            });
-        Self::Ipc(directory.join("coseg.sock"))
+        Self::Ipc(DefaultFolder::of_this_process().path().join("coseg.sock"))
+    }
+
+    /// The same for a client, which must not talk to whoever made that folder first: it belongs to this user or to root,
+    /// and nobody else may enter it; the folder of a service may let a group in.
+    pub fn default_for_client() -> Result<Self, EndpointError> {
+        DefaultFolder::of_this_process().check()?;
+        Ok(Self::default_for_user())
     }
 
     /// Where events are published beside this endpoint: the path with `.events`, or the next port
@@ -207,6 +207,10 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .map_err(io(&lock_path))?;
     let in_use = || EndpointError::InUse {
         path: path.display().to_string(),
+        holder: match fs::read_to_string(&lock_path).map(|text| text.trim().parse()) {
+            Ok(Ok::<u32, _>(pid)) => format!(", process {pid}"),
+            _ => String::new(),
+        },
     };
     rustix::fs::flock(&lock, rustix::fs::FlockOperation::NonBlockingLockExclusive)
         .map_err(|_| in_use())?;
@@ -227,56 +231,11 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
             fs::remove_file(path).map_err(io(path))?;
         }
     }
+    // For whoever finds the lock taken; what a daemon that ended has left there is never read.
+    let _ = lock
+        .set_len(0)
+        .and_then(|()| (&lock).write_all(std::process::id().to_string().as_bytes()));
     Ok(lock)
-}
-
-/// Creates `directory` for its owner alone, or checks that no other user can put files there.
-fn private_directory(directory: &Path) -> Result<(), EndpointError> {
-    let name = || directory.display().to_string();
-    match fs::DirBuilder::new()
-        .mode(0o700)
-        .recursive(true)
-        .create(directory)
-    {
-        Ok(()) => {}
-        Err(source) => {
-            return Err(EndpointError::Io {
-                path: name(),
-                source,
-            });
-        }
-    }
-    let metadata = fs::metadata(directory).map_err(|source| EndpointError::Io {
-        path: name(),
-        source,
-    })?;
-    let refuse = |message: String| {
-        Err(EndpointError::Directory {
-            path: name(),
-            message,
-        })
-    };
-    let (uid, mode) = (rustix::process::getuid().as_raw(), metadata.mode() & 0o7777);
-    let sticky = mode & 0o1000 != 0;
-    if metadata.uid() != uid && !(metadata.uid() == 0 && (sticky || mode & 0o022 == 0)) {
-        return refuse(format!("belongs to user {}, not to {uid}", metadata.uid()));
-    }
-    // The predictable name below /tmp could have been prepared by anybody.
-    let well_known = directory.parent() == Some(Path::new("/tmp"))
-        && directory
-            .file_name()
-            .is_some_and(|n| n.to_string_lossy().starts_with("coseg-"));
-    if well_known && (mode & 0o077 != 0 || metadata.uid() != uid) {
-        return refuse(format!(
-            "has mode {mode:04o}, others may enter; expected 0700"
-        ));
-    }
-    if mode & 0o022 != 0 && !sticky {
-        return refuse(format!(
-            "has mode {mode:04o}, others may write; expected 0700"
-        ));
-    }
-    Ok(())
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Shapes are accepted, described and placed; each request takes effect once.
 
-use super::collections::check_name;
+use super::collections::check_shape_name;
 use super::isolate::DescribeJob;
 use super::jobs::Attempts;
 use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
@@ -18,8 +18,6 @@ use crate::store::{
 use std::cell::RefCell;
 use std::sync::PoisonError;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
-
-const MAX_SHAPE_NAME: usize = 255;
 
 /// Shapes whose files are durable, and that count once they are submitted.
 #[derive(Debug, Default)]
@@ -62,7 +60,7 @@ impl Library {
     /// A bad name; the disk.
     pub fn keep(&self, shapes: Vec<NewShape>) -> Result<KeptShapes> {
         for s in &shapes {
-            check_name("shape", &s.name, MAX_SHAPE_NAME)?;
+            check_shape_name(&s.name)?;
         }
         let mut kept = KeptShapes::default();
         for s in shapes {
@@ -132,10 +130,7 @@ impl Library {
     pub fn job(&self, id: u64) -> Result<Job> {
         let (job, items) = self.store.catalog().read(|r| -> Result<_> {
             let job = r.job(id)?;
-            let job = job.ok_or_else(|| LibraryError::NotFound {
-                what: "job",
-                name: id.to_string(),
-            })?;
+            let job = job.ok_or_else(|| LibraryError::not_found("job", id.to_string()))?;
             Ok((job, r.job_items(id)?))
         })?;
         let carrying = if items.is_empty() {
@@ -307,11 +302,7 @@ impl Library {
         described: std::result::Result<Described, Failure>,
     ) -> Result<ItemState> {
         let Ok(collection) = self.collection_row(&item.collection) else {
-            let name = item.collection.clone();
-            let gone = LibraryError::NotFound {
-                what: "collection",
-                name,
-            };
+            let gone = LibraryError::not_found("collection", &item.collection);
             return self.fail(item, failure(&gone));
         };
         self.with_lane(collection, |lane| {
@@ -412,9 +403,9 @@ impl Library {
             .store
             .catalog()
             .read(|r| r.job_item(item.job, item.index).map_err(LibraryError::from))?;
-        row.ok_or_else(|| LibraryError::NotFound {
-            what: "job item",
-            name: format!("{} of job {}", item.index, item.job),
+        row.ok_or_else(|| {
+            let name = format!("{} of job {}", item.index, item.job);
+            LibraryError::not_found("job item", name)
         })
     }
 

@@ -4,7 +4,7 @@ import { randomUUID } from "node:crypto";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fromBinary } from "@bufbuild/protobuf";
 import { batches, type Batch, type Item } from "./batch.js";
-import { BadReply, EventLogRewound, NoAnswer, Refused } from "./errors.js";
+import { BadReply, CosegError, EventLogRewound, NoAnswer, Refused } from "./errors.js";
 import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import { EventSchema } from "./gen/coseg/v1/event_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
@@ -290,6 +290,9 @@ export class Collection {
     let shape = [values.length];
     if (values instanceof Float32Array) {
       const n = (await this.shape(from)).nPolygons;
+      if (values.length === 0 || values.length % n !== 0) {
+        throw new CosegError(`${values.length} values are not as many for each of the ${n} faces of ${from}`);
+      }
       shape = [n, values.length / n];
     }
     const array = writer.array(values, ...shape);

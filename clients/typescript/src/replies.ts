@@ -47,6 +47,7 @@ export function functionalMap(from: string, to: string, reply: GetFunctionalMapR
     p2p21: raw.array(Uint32Array, p2p21).data,
     quality: mapQuality(quality),
     matched: raw.array(Uint32Array, matched).data,
+    n1: reply.n1,
   });
   return {
     ...one(reply.c12, reply.p2p21, reply.quality, reply.matched),

@@ -2,6 +2,7 @@
 
 use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
+use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, error::Subject, shape_input};
 use crate::library::{Carrying, ItemState, Job, JobItem, NewShape, Outcome, Placed};
 use crate::mesh::Format;
@@ -88,10 +89,12 @@ fn new_shape(
     ingest: &Ingest<'_>,
 ) -> Result<NewShape, wire::Error> {
     let too_large = |found: u64| {
-        let limit = ingest.max_shape_bytes;
-        let message = format!(
-            "{field} ({:?}) has {found} bytes, the limit is {limit}",
-            shape.name
+        let what = format!("{field} ({:?})", shape.name);
+        let message = size::beyond(
+            &what,
+            found,
+            ingest.max_shape_bytes,
+            "limits.max_shape, within limits.memory",
         );
         field_error(ErrorReason::MeshTooLarge, field, message)
     };

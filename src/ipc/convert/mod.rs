@@ -9,8 +9,8 @@ mod jobs;
 mod shapes;
 
 pub use analysis::{
-    agreement, descriptors, functional_map, hks, nearest, part_correspondence, point_maps,
-    point_request, polygon_values, spectrum, transferred,
+    agreement, descriptors, from_vertices, functional_map, hks, nearest, part_correspondence,
+    point_maps, point_request, polygon_values, spectrum, transferred,
 };
 pub use collections::{collection, collection_differs, collection_spec, label_info};
 pub use corrections::{corrected, correction, suggested, undone};

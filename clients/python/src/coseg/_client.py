@@ -17,6 +17,7 @@ from coseg._sync_transport import Subscription, Transport
 from coseg._batch import Batch, Item, batches
 from coseg._link import Frame
 from coseg._options import Curve, default_endpoint, new_client_id, reachable
+from coseg._size import beyond
 from coseg._wire import FrameWriter, Mesh, Raw
 from coseg.errors import BadReply, CosegError, EventLogRewound, NoAnswer, Refused
 from coseg.v1 import collection_pb2, event_pb2, message_pb2
@@ -119,7 +120,7 @@ class Library:
         if self._hello is not None:
             n_bytes, limit = sum(map(len, message)), self._hello.limits.max_message_bytes
             if n_bytes > limit:
-                raise CosegError(f"the message has {n_bytes} bytes, the daemon's limit is {limit}")
+                raise CosegError(beyond("the message has", n_bytes, limit, "limits.max_message"))
 
     # -- the daemon -----------------------------------------------------------------------------
 
@@ -503,6 +504,8 @@ class Collection:
     ) -> t.Transferred:
         """What :meth:`transfer` gives, with the quality of the map."""
         array, writer = np.asarray(values), FrameWriter()
+        if array.ndim == 0 or array.size == 0 or array.dtype.kind not in "biuf":
+            raise ValueError(f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each face")
         if array.dtype.kind in "iu":
             ref = writer.array(_integers(array, np.int32, "values"))
         else:

@@ -351,6 +351,7 @@ def functional_map(
             raw.array(reply.alternative_p2p_21),
             map_quality(reply.alternative_quality),
             raw.array(reply.alternative_matched) != 0,
+            n1=reply.n1,
         )
     return t.FunctionalMap(
         source,
@@ -363,6 +364,7 @@ def functional_map(
         agreement=flat(t.MapAgreement, reply.agreement) if reply.HasField("agreement") else None,
         alternative=alternative,
         alternative_cost=reply.alternative_cost if reply.HasField("alternative_cost") else None,
+        n1=reply.n1,
     )
 
 
