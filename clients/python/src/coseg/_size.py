@@ -15,6 +15,4 @@ def in_words(n: int) -> str:
 
 def beyond(what: str, found: int, limit: int, key: str) -> str:
     """That something is larger than a limit, and which setting of the daemon raises that."""
-    return (
-        f"{what} {in_words(found)}, the limit is {in_words(limit)} ({key} of the daemon's configuration)"
-    )
+    return f"{what} {in_words(found)}, the limit is {in_words(limit)} ({key} of the daemon's configuration)"
