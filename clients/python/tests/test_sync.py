@@ -108,10 +108,10 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert np.abs(pulled - fmap.c_12).max() < 0.05
     # Values of another shape, at faces, or a single one are not values at its vertices.
     assert fmap.n1 == len(proxy.vertices)
-    for wrong in (phi[:-1], np.zeros(fmap.n1 + 1), np.zeros(len(proxy.faces)), np.zeros(()), []):
-        n = len(wrong) if np.ndim(wrong) else 0
+    for wrong in (phi[:-1], np.zeros(fmap.n1 + 1), np.zeros(len(proxy.faces)), np.zeros(())):
+        n = len(wrong) if wrong.ndim else 0
         with pytest.raises(ValueError, match=f"values have {n} rows, .* has {fmap.n1} vertices"):
-            fmap.carry(wrong)  # type: ignore[arg-type]
+            fmap.carry(wrong)
     assert fmap.quality.coverage > 0
     assert fmap.quality.expected_error is None
     assert fmap.confidence is not None and fmap.confidence.shape == fmap.matched.shape == (n_b,)

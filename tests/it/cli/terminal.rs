@@ -96,10 +96,10 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
         .spawn()
         .unwrap();
     // The first is there, so its job and those sent ahead are accepted.
+    // Kept open: who closes a pipe ends the command in another way.
+    let mut lines = BufReader::new(child.stdout.take().unwrap());
     let mut first = String::new();
-    BufReader::new(child.stdout.take().unwrap())
-        .read_line(&mut first)
-        .unwrap();
+    lines.read_line(&mut first).unwrap();
     assert!(first.starts_with("0: added"), "{first}");
     kill_process(Pid::from_child(&child), Signal::INT).unwrap();
     let output = child.wait_with_output().unwrap();

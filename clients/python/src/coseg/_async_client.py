@@ -540,8 +540,8 @@ class AsyncCollection:
         label: int | str | None = None,
     ) -> t.Corrected:
         """Labels faces of a shape by hand: ``labels`` for all of them (−1 leaves one alone), or one
-        ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves; other
-        shapes follow in the background: :meth:`wait_idle`."""
+        ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves;
+        other shapes follow in the background: :meth:`wait_idle`."""
         writer = FrameWriter()
         fields: dict[str, Any]
         if labels is not None and faces is None and part is None and label is None:
@@ -563,8 +563,8 @@ class AsyncCollection:
 
     async def merge(self, label: int | str, into: int | str) -> t.ChangedLabel:
         """Makes one label of two: faces of ``label`` carry ``into`` from now on. Both by id or name."""
-        ids = {"label": await self._label(label), "into": await self._label(into)}
-        reply, _ = await self._call("merge_labels", **ids)
+        label, into = await self._label(label), await self._label(into)
+        reply, _ = await self._call("merge_labels", label=label, into=into)
         return wire.changed_label(reply)
 
     async def split(self, label: int | str) -> t.ChangedLabel:

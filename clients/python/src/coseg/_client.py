@@ -505,7 +505,9 @@ class Collection:
         """What :meth:`transfer` gives, with the quality of the map."""
         array, writer = np.asarray(values), FrameWriter()
         if array.ndim == 0 or array.size == 0 or array.dtype.kind not in "biuf":
-            raise ValueError(f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each face")
+            raise ValueError(
+                f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each face"
+            )
         if array.dtype.kind in "iu":
             ref = writer.array(_integers(array, np.int32, "values"))
         else:
@@ -538,8 +540,8 @@ class Collection:
         label: int | str | None = None,
     ) -> t.Corrected:
         """Labels faces of a shape by hand: ``labels`` for all of them (−1 leaves one alone), or one
-        ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves; other
-        shapes follow in the background: :meth:`wait_idle`."""
+        ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves;
+        other shapes follow in the background: :meth:`wait_idle`."""
         writer = FrameWriter()
         fields: dict[str, Any]
         if labels is not None and faces is None and part is None and label is None:
@@ -561,8 +563,8 @@ class Collection:
 
     def merge(self, label: int | str, into: int | str) -> t.ChangedLabel:
         """Makes one label of two: faces of ``label`` carry ``into`` from now on. Both by id or name."""
-        ids = {"label": self._label(label), "into": self._label(into)}
-        reply, _ = self._call("merge_labels", **ids)
+        label, into = self._label(label), self._label(into)
+        reply, _ = self._call("merge_labels", label=label, into=into)
         return wire.changed_label(reply)
 
     def split(self, label: int | str) -> t.ChangedLabel:

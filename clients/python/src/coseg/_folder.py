@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from contextlib import suppress
 
 from coseg.errors import CosegError
 
@@ -11,9 +12,9 @@ from coseg.errors import CosegError
 def default_folder() -> str:
     """``$RUNTIME_DIRECTORY``, else ``$XDG_RUNTIME_DIR/coseg``, else ``/tmp/coseg-UID``.
 
-    Raises :class:`CosegError` if anybody but this user and root could listen there. The folder of a service may
-    let a group in, that of a user nobody. One below ``/tmp`` that is missing is made, so that nobody else makes it
-    while the client waits for a daemon.
+    Raises :class:`CosegError` if anybody but this user and root could listen there. The folder of a
+    service may let a group in, that of a user nobody. One below ``/tmp`` that is missing is made, so
+    that nobody else makes it while the client waits for a daemon.
     """
     if folder := os.environ.get("RUNTIME_DIRECTORY"):
         check_folder(folder, forbidden=0o022)
@@ -23,17 +24,15 @@ def default_folder() -> str:
     else:
         folder = f"/tmp/coseg-{os.getuid()}"
     if os.path.dirname(folder) == "/tmp":
-        try:
+        with suppress(FileExistsError):
             os.mkdir(folder, 0o700)
-        except FileExistsError:
-            pass
     check_folder(folder, forbidden=0o077)
     return folder
 
 
 def check_folder(folder: str, forbidden: int) -> None:
-    """Raises :class:`CosegError` if the folder, or a link to it, belongs to another user, or others may do what
-    the bits say."""
+    """Raises :class:`CosegError` if the folder, or a link to it, belongs to another user, or others may
+    do what the bits say."""
     # A link is judged as well as what it leads to: who can change it can lead elsewhere.
     for follow in (False, True):
         try:
@@ -44,8 +43,8 @@ def check_folder(folder: str, forbidden: int) -> None:
         me = os.getuid()
         if found.st_uid not in (me, 0):
             raise CosegError(
-                f"{folder} belongs to user {found.st_uid}, not to {me}, {doubt}; remove it, set XDG_RUNTIME_DIR "
-                "to a folder of your own, or name the daemon's endpoint"
+                f"{folder} belongs to user {found.st_uid}, not to {me}, {doubt}; remove it, set "
+                "XDG_RUNTIME_DIR to a folder of your own, or name the daemon's endpoint"
             )
         mode = stat.S_IMODE(found.st_mode)
         if not stat.S_ISLNK(found.st_mode) and mode & forbidden:

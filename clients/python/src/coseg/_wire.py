@@ -37,6 +37,10 @@ _DTYPES: dict[int, np.dtype[Any]] = {
 _WIRE_DTYPES: dict[np.dtype[Any], Any] = {dtype: wire for wire, dtype in _DTYPES.items()}
 
 
+#: Most kinds of parts that a collection can be told to have.
+MAX_PARTS = 64
+
+
 @runtime_checkable
 class HasFaces(Protocol):
     """A mesh object, such as ``trimesh.Trimesh``."""
@@ -245,6 +249,8 @@ def collection_spec(
     """What a collection is created with."""
     spec = collection_pb2.CollectionSpec(name=name, working_faces=working_faces)
     if parts is not None:
+        if not 0 <= parts <= MAX_PARTS:
+            raise ValueError(f"parts is {parts}, but must be 1 to {MAX_PARTS}, or 0: estimated")
         spec.n_parts = parts
     if up is not None:
         key = "UP_" + up.upper().replace("+", "PLUS_").replace("-", "MINUS_")

@@ -345,8 +345,8 @@ class FunctionalMap:
     def carry(self, values: NDArray[Element]) -> NDArray[Element]:
         """Carries values at vertices of shape 1's working mesh, (n1, …), to those of shape 2's, (n2, …).
 
-        Raises :class:`ValueError` if there are not n1 of them: values at faces, at vertices of the file, or of the
-        other shape would be carried without a word, and mean nothing.
+        Raises :class:`ValueError` if there are not n1 of them: values at faces, at vertices of the
+        file, or of the other shape would be carried without a word, and mean nothing.
         """
         array = np.asarray(values)
         n = len(array) if array.ndim else 0
