@@ -3,7 +3,8 @@
 use super::CommandError;
 use std::io::{IsTerminal as _, Write as _, stderr, stdin};
 
-/// Whether to go on: asked on a terminal, unless `yes` says so. A script is not asked: there the command is the answer.
+/// Whether to go on: asked on a terminal, unless `yes` says so. A script is not asked: there the
+/// command is the answer.
 pub(super) fn confirmed(question: &str, yes: bool) -> Result<bool, CommandError> {
     if yes || !stdin().is_terminal() || !stderr().is_terminal() {
         return Ok(true);

@@ -1,4 +1,5 @@
-//! `coseg jobs`, `coseg retry` and `coseg cancel`: what became of what was added, and trying again or giving up.
+//! `coseg jobs`, `coseg retry` and `coseg cancel`: what became of what was added, and trying again
+//! or giving up.
 
 use super::session::{Session, table};
 use super::{CommandError, Outcome, interrupt};

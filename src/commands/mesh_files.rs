@@ -35,10 +35,11 @@ pub(super) struct Found {
     pub(super) notes: Vec<String>,
 }
 
-/// The files of the paths: as named, those of a folder as people count, with `recursive` also those of its subfolders.
+/// The files of the paths: as named, those of a folder as people count, with `recursive` also those
+/// of its subfolders.
 ///
-/// A shape is named by its file's stem; with `recursive` by its path below the folder, `__` for each `/`. Of two files
-/// of one name the first is sent.
+/// A shape is named by its file's stem; with `recursive` by its path below the folder, `__` for
+/// each `/`. Of two files of one name the first is sent.
 pub(super) fn find(paths: &[PathBuf], recursive: bool) -> Result<Found, CommandError> {
     let mut search = Search {
         found: Found::default(),
@@ -169,7 +170,8 @@ impl Search {
         Ok(())
     }
 
-    /// A file whose extension says that it is a mesh, in these folders below the one that was named.
+    /// A file whose extension says that it is a mesh, in these folders below the one that was
+    /// named.
     fn file(&mut self, path: &Path, within: &[String]) {
         let name = path.file_name().unwrap_or_default();
         let format = Format::from_name(&name.to_string_lossy());

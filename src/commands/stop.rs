@@ -65,7 +65,8 @@ fn what_is_waited_for(in_work: &[String], n_queued: u64) -> String {
     }
 }
 
-/// Waits until nobody listens at the endpoint any more; not for ever, since a supervisor may have started another daemon.
+/// Waits until nobody listens at the endpoint any more; not for ever, since a supervisor may have
+/// started another daemon.
 fn wait_until_gone(endpoint: &Endpoint) -> Result<(), CommandError> {
     let begin = Instant::now();
     while listens(endpoint) {

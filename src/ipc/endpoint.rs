@@ -133,8 +133,9 @@ impl Endpoint {
         Self::Ipc(DefaultFolder::of_this_process().path().join("coseg.sock"))
     }
 
-    /// The same for a client, which must not talk to whoever made that folder first: it belongs to this user or to root,
-    /// and nobody else may enter it; the folder of a service may let a group in.
+    /// The same for a client, which must not talk to whoever made that folder first: it belongs to
+    /// this user or to root, and nobody else may enter it; the folder of a service may let a group
+    /// in.
     pub fn default_for_client() -> Result<Self, EndpointError> {
         DefaultFolder::of_this_process().check()?;
         Ok(Self::default_for_user())

@@ -37,8 +37,8 @@ impl DefaultFolder {
         }
     }
 
-    /// Refuses the folder if anybody but this user and root could listen there. One below `/tmp` that is missing is made,
-    /// so that nobody else makes it while a client waits for a daemon.
+    /// Refuses the folder if anybody but this user and root could listen there. One below `/tmp`
+    /// that is missing is made, so that nobody else makes it while a client waits for a daemon.
     pub(super) fn check(&self) -> Result<(), EndpointError> {
         let (path, forbidden) = match self {
             Self::Service(path) => (path, 0o022),

@@ -7,7 +7,8 @@ const UNITS: [(&str, u64); 4] = [
     ("KiB", 1 << 10),
 ];
 
-/// `64 MiB` where it is just that, `76.3 MiB (80000000 bytes)` where it is rounded, `999 bytes` below a KiB.
+/// `64 MiB` where it is just that, `76.3 MiB (80000000 bytes)` where it is rounded, `999 bytes`
+/// below a KiB.
 pub fn in_words(n: u64) -> String {
     match UNITS.iter().find(|(_, unit)| n >= *unit) {
         None if n == 1 => "1 byte".to_owned(),

@@ -2,13 +2,14 @@
 
 use strsim::osa_distance;
 
-/// Longest names that are compared, in characters: what is compared costs the product of the lengths.
+/// Longest names that are compared, in characters: what is compared costs the product of the
+/// lengths.
 const LONGEST: usize = 64;
 /// Most letters that differ, however long a name is.
 const MOST_SLIPS: usize = 3;
 
-/// The known name that is most like `name`, if one is so like it that it was probably meant: the same in other letter
-/// case, or a slip for each three letters away, at most three.
+/// The known name that is most like `name`, if one is so like it that it was probably meant: the
+/// same in other letter case, or a slip for each three letters away, at most three.
 pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let wanted = name.to_lowercase();
     let n = wanted.chars().count();

@@ -18,7 +18,8 @@ use crate::store::rows::confidence_from_u8;
 use crate::store::{CollectionRow, Digest, LabelVersionRow, MappedDescription, Reader, ShapeRow};
 use std::sync::atomic::Ordering;
 
-/// Names among which one that was probably meant is looked for, so that a wrong name costs little in any library.
+/// Names among which one that was probably meant is looked for, so that a wrong name costs little
+/// in any library.
 const MAX_COMPARED: u32 = 5_000;
 
 impl Library {

@@ -71,8 +71,8 @@ impl LibraryLock {
         self.write(endpoint)
     }
 
-    /// The process id on the first line, the endpoint, if there is one, on the second: one write, so that nobody reads
-    /// half of it but between the two steps, when there is nothing.
+    /// The process id on the first line, the endpoint, if there is one, on the second: one write,
+    /// so that nobody reads half of it but between the two steps, when there is nothing.
     fn write(&self, endpoint: &str) -> std::io::Result<()> {
         let text = format!("{}\n{endpoint}\n", std::process::id());
         self.file.set_len(0)?;
@@ -85,7 +85,8 @@ impl LibraryLock {
     }
 }
 
-/// What a lock file says of who holds it. Words for people and a hint of how long to wait: nothing else follows from it.
+/// What a lock file says of who holds it. Words for people and a hint of how long to wait: nothing
+/// else follows from it.
 #[derive(Debug, Default, PartialEq)]
 struct Holder {
     pid: Option<Pid>,

@@ -25,7 +25,8 @@ fn numbers(row: &[String]) -> Vec<&str> {
     row.iter().filter_map(|cell| number(cell)).collect()
 }
 
-/// Rows of the README's table of accuracy that differ from those of the page, and what is wrong with the page itself.
+/// Rows of the README's table of accuracy that differ from those of the page, and what is wrong
+/// with the page itself.
 pub(super) fn accuracy_faults(readme: &str, page: &str) -> Vec<String> {
     let heading = "0 labelled";
     let section = |text: &str, title: &str| {
