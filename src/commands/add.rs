@@ -226,7 +226,9 @@ fn accepted(
             "n_failed": n_failed,
         }))?;
     } else {
-        eprintln!("{n} shapes accepted into {collection}");
+        let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
+        let ids = ids.join(" ");
+        eprintln!("{n} shapes accepted into {collection}, jobs {ids}");
     }
     Ok(n_failed == 0)
 }

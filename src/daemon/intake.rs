@@ -273,25 +273,32 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
     let max_secs = limits.max_queued_seconds as f64;
     let max_shapes = limits.max_queued_shapes as f64;
     let max_bytes = limits.max_queued_bytes.0 as f64;
-    let bytes_in_words = |n: f64| in_words(n as u64);
-    let seconds_in_words = |n: f64| format!("{n} seconds of work");
-    let shapes_in_words = |n: f64| format!("{n} shapes");
-    let words: [(&str, &dyn Fn(f64) -> String); 3] = [
-        ("limits.max_queued_shapes", &shapes_in_words),
-        ("limits.max_queued_bytes", &bytes_in_words),
-        ("limits.max_queued_seconds", &seconds_in_words),
-    ];
-    for ((key, words), asked, queued, limit) in [
-        (words[0], n as f64, load.n_shapes as f64, max_shapes),
-        (words[1], bytes as f64, load.n_bytes as f64, max_bytes),
+    type Bound = (&'static str, fn(f64) -> String, f64, f64, f64);
+    let bounds: [Bound; 3] = [
+        (
+            "limits.max_queued_shapes",
+            |n| format!("{n} shapes"),
+            n as f64,
+            load.n_shapes as f64,
+            max_shapes,
+        ),
+        (
+            "limits.max_queued_bytes",
+            |n| in_words(n as u64),
+            bytes as f64,
+            load.n_bytes as f64,
+            max_bytes,
+        ),
         // An estimate alone refuses nothing for good: an empty queue takes whatever it says.
         (
-            words[2],
+            "limits.max_queued_seconds",
+            |n| format!("{n} seconds of work"),
             secs.ceil().min(max_secs),
             load.seconds().floor(),
             max_secs,
         ),
-    ] {
+    ];
+    for (key, words, asked, queued, limit) in bounds {
         if asked > limit {
             let (asked, limit) = (words(asked), words(limit));
             let text = format!("the request has {asked}, the whole queue holds {limit} ({key})");

@@ -5,10 +5,13 @@ use std::fmt;
 use std::fs;
 use std::io::Write as _;
 use std::net::IpAddr;
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 /// Bytes of the path of a Unix socket, as the kernel's `sockaddr_un` has it, less the final NUL.
 pub const MAX_SOCKET_PATH_BYTES: usize = 107;
+/// How a lock file is opened: whoever may put a link in its folder does not choose what is locked.
+const NO_LINKS: i32 = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
 /// What is appended to the request socket's path for the event socket.
 const EVENTS_SUFFIX: &str = ".events";
 
@@ -204,6 +207,7 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .create(true)
         .truncate(false)
         .write(true)
+        .custom_flags(NO_LINKS)
         .open(&lock_path)
         .map_err(io(&lock_path))?;
     let in_use = || EndpointError::InUse {
@@ -232,11 +236,20 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
             fs::remove_file(path).map_err(io(path))?;
         }
     }
-    // For whoever finds the lock taken; what a daemon that ended has left there is never read.
-    let _ = lock
-        .set_len(0)
-        .and_then(|()| (&lock).write_all(std::process::id().to_string().as_bytes()));
+    tell_holder(&lock).map_err(io(&lock_path))?;
     Ok(lock)
+}
+
+/// Writes this process's id for whoever finds the lock taken; what a daemon that ended has left there
+/// is never read. Not to a file that somebody else has put there: a folder may be open to others.
+fn tell_holder(mut lock: &fs::File) -> std::io::Result<()> {
+    let found = lock.metadata()?;
+    let is_ours = found.uid() == rustix::process::getuid().as_raw() && found.nlink() == 1;
+    if !is_ours || !found.is_file() {
+        return Ok(());
+    }
+    lock.set_len(0)?;
+    lock.write_all(std::process::id().to_string().as_bytes())
 }
 
 #[cfg(test)]
@@ -346,6 +359,28 @@ mod tests {
         assert!(path.exists());
         let _lock = claim_socket(&path).unwrap();
         assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_lock_that_leads_elsewhere_is_neither_followed_nor_written() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, victim) = (directory.path().join("s"), directory.path().join("victim"));
+        let lock = directory.path().join("s.lock");
+        std::fs::write(&victim, "precious").unwrap();
+        std::os::unix::fs::symlink(&victim, &lock).unwrap();
+        assert!(matches!(claim_socket(&path), Err(EndpointError::Io { .. })));
+        std::fs::remove_file(&lock).unwrap();
+        std::fs::hard_link(&victim, &lock).unwrap();
+        drop(claim_socket(&path).unwrap());
+        assert_eq!(std::fs::read_to_string(&victim).unwrap(), "precious");
+        std::fs::remove_file(&lock).unwrap();
+        let _lock = claim_socket(&path).unwrap();
+        let said = claim_socket(&path).unwrap_err().to_string();
+        let pid = std::process::id();
+        assert!(
+            said.contains(&format!("running daemon, process {pid}; ")),
+            "{said}"
+        );
     }
 
     #[test]
