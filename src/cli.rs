@@ -5,7 +5,7 @@ mod carrying;
 mod corrections;
 mod looking;
 
-pub(crate) use care::{Jobs, Keys, KeysCommand, Restore, Retry, Snapshot};
+pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use carrying::{Map, Transfer};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
@@ -15,6 +15,7 @@ use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use coseg::ipc::wire;
+use coseg::library::MAX_PARTS;
 use coseg::operators;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -104,7 +105,7 @@ pub(crate) enum Command {
     /// Add meshes, and wait until they are labelled
     Add(Add),
     /// Wait until a collection has nothing left to do
-    Wait(InCollection),
+    Wait(Wait),
     /// List collections, or the shapes of one
     Ls(Ls),
     /// Show one shape, or the collection
@@ -149,7 +150,7 @@ pub(crate) enum Command {
     /// Follow queue, rates and stages of the daemon, as they change
     Top(Top),
     /// Let the daemon finish what it is at and stop
-    Stop,
+    Stop(Stop),
     /// Compute the spectrum and descriptors of one mesh, without a daemon
     Describe(Describe),
     /// Make a family of labelled shapes
@@ -160,6 +161,8 @@ pub(crate) enum Command {
     Jobs(Jobs),
     /// Queue the failed shapes of a job again
     Retry(Retry),
+    /// Cancel the shapes of a job that are not placed yet
+    Cancel(Cancel),
     /// Make keys, and say who may connect
     Keys(Keys),
     /// Describe shapes for a daemon, which starts this by itself
@@ -227,11 +230,47 @@ pub(crate) struct InCollection {
     pub(crate) collection: Option<String>,
 }
 
+/// Which collection, of a command that names nothing else by its place.
+#[derive(Debug, Clone, Default, Args)]
+pub(crate) struct OneCollection {
+    /// The collection; may be left out if there is only one
+    #[arg(id = "COLLECTION", value_name = "COLLECTION")]
+    name: Option<String>,
+    /// The same
+    #[arg(
+        long = "collection",
+        short,
+        value_name = "NAME",
+        conflicts_with = "COLLECTION"
+    )]
+    collection: Option<String>,
+}
+
+impl OneCollection {
+    /// The one that was named, in either way.
+    pub(crate) fn named(&self) -> Option<&String> {
+        self.name.as_ref().or(self.collection.as_ref())
+    }
+
+    pub(crate) fn within(&self) -> InCollection {
+        InCollection {
+            collection: self.named().cloned(),
+        }
+    }
+}
+
+/// `coseg wait`
+#[derive(Debug, Args)]
+pub(crate) struct Wait {
+    #[command(flatten)]
+    pub(crate) of: OneCollection,
+}
+
 /// Settings of a collection; those not given take their defaults, or are as they are.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Settings {
-    /// Number of part kinds; 0: estimated [default: estimated]
-    #[arg(long, value_name = "N")]
+    /// Number of part kinds, 1 to 64; 0: estimated [default: estimated]
+    #[arg(long, value_name = "N", value_parser = parts, allow_hyphen_values = true)]
     pub(crate) parts: Option<u32>,
     /// The axis that points up in every file: +x -x +y -y +z -z unknown auto [default: unknown]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
@@ -257,6 +296,15 @@ impl Settings {
                 .into(),
             working_faces: self.working_faces.unwrap_or(0),
         }
+    }
+}
+
+/// A number of part kinds, as far as that can be told without the daemon.
+pub(crate) fn parts(text: &str) -> Result<u32, String> {
+    let why = "the number of part kinds is 1 to 64; 0, or no --parts, lets it be estimated";
+    match text.parse() {
+        Ok(n) if n <= MAX_PARTS => Ok(n),
+        _ => Err(why.to_owned()),
     }
 }
 
@@ -318,6 +366,9 @@ pub(crate) struct Add {
     /// Mesh files (.obj, .off, .ply, .stl, .glb, .gltf), or folders of them; a shape's name is its file's stem
     #[arg(required = true, value_name = "PATH")]
     pub(crate) paths: Vec<PathBuf>,
+    /// Also meshes in subfolders: a/b/1.obj below a named folder becomes the shape a__b__1
+    #[arg(long, short)]
+    pub(crate) recursive: bool,
     /// The collection, created if missing; without it the only one there is, or a new one named default
     #[arg(long, short, value_name = "NAME")]
     pub(crate) collection: Option<String>,
@@ -335,11 +386,11 @@ pub(crate) struct Add {
 #[derive(Debug, Args)]
 pub(crate) struct Ls {
     /// List the shapes of this collection
-    #[arg(long, short, value_name = "NAME")]
-    pub(crate) collection: Option<String>,
-    /// Only shapes that carry this label
-    #[arg(long, value_name = "ID", requires = "collection")]
-    pub(crate) label: Option<u32>,
+    #[command(flatten)]
+    pub(crate) of: OneCollection,
+    /// Only shapes that carry this label, an id or a name
+    #[arg(long, value_name = "LABEL")]
+    pub(crate) label: Option<String>,
 }
 
 /// `coseg show`
@@ -428,16 +479,19 @@ pub(crate) struct Rm {
     pub(crate) shapes: Vec<String>,
     #[command(flatten)]
     pub(crate) within: InCollection,
+    /// Do not ask; without a terminal nothing is asked anyway
+    #[arg(long, short)]
+    pub(crate) yes: bool,
 }
 
 /// `coseg watch`
 #[derive(Debug, Args)]
 pub(crate) struct Watch {
     /// Only this collection
-    #[arg(long, short, value_name = "NAME")]
-    pub(crate) collection: Option<String>,
-    /// Begin with the events after this number [default: with the next one]
-    #[arg(long, value_name = "SEQUENCE", requires = "collection")]
+    #[command(flatten)]
+    pub(crate) of: OneCollection,
+    /// Begin with the events of a collection after this number [default: with the next one]
+    #[arg(long, value_name = "SEQUENCE")]
     pub(crate) since: Option<u64>,
     /// End after this many events
     #[arg(long, short = 'n', value_name = "N")]
@@ -448,7 +502,7 @@ pub(crate) struct Watch {
 #[derive(Debug, Args)]
 pub(crate) struct Events {
     #[command(flatten)]
-    pub(crate) within: InCollection,
+    pub(crate) of: OneCollection,
     /// Events after this number
     #[arg(long, value_name = "SEQUENCE", default_value_t = 0)]
     pub(crate) since: u64,
@@ -460,9 +514,9 @@ pub(crate) struct Events {
 /// `coseg name`
 #[derive(Debug, Args)]
 pub(crate) struct Name {
-    /// The label's id
-    pub(crate) label: u32,
-    /// Its name
+    /// The label: its id, or the name it has
+    pub(crate) label: String,
+    /// The name it gets
     pub(crate) name: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
@@ -482,6 +536,9 @@ pub(crate) enum Collections {
     Delete {
         /// Its name
         name: String,
+        /// Do not ask; without a terminal nothing is asked anyway
+        #[arg(long, short)]
+        yes: bool,
     },
 }
 
@@ -540,5 +597,35 @@ mod tests {
         }
         assert!(Cli::try_parse_from(["coseg", "add", "x.off", "--up", "w"]).is_err());
         assert!(Cli::try_parse_from(["coseg", "ls", "--timeout", "0"]).is_err());
+    }
+
+    #[test]
+    fn a_number_of_parts_out_of_range_hears_the_range() {
+        for parts in ["-1", "65", "4.5", "many", ""] {
+            let line = ["coseg", "add", "x.off", "--parts", parts];
+            let said = Cli::try_parse_from(line).unwrap_err().to_string();
+            assert!(
+                said.contains("1 to 64; 0, or no --parts"),
+                "{parts}: {said}"
+            );
+        }
+        assert!(Cli::try_parse_from(["coseg", "add", "x.off", "--parts", "64"]).is_ok());
+    }
+
+    #[test]
+    fn one_collection_is_named_by_its_place_or_by_a_flag() {
+        for command in ["ls", "wait", "events", "watch", "suggest", "undo", "jobs"] {
+            for line in [
+                &["coseg", command, "chairs"][..],
+                &["coseg", command, "--collection", "chairs"],
+                &["coseg", command, "-c", "chairs"],
+                &["coseg", command],
+            ] {
+                let parsed = Cli::try_parse_from(line);
+                assert!(parsed.is_ok(), "{line:?}: {parsed:?}");
+            }
+            let both = ["coseg", command, "chairs", "-c", "chairs"];
+            assert!(Cli::try_parse_from(both).is_err(), "{command}");
+        }
     }
 }

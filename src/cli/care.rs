@@ -1,5 +1,6 @@
 //! Flags of the commands for whoever looks after a daemon: keys, jobs, check, snapshots.
 
+use super::OneCollection;
 use clap::{Args, Subcommand};
 use coseg::ipc::keys::Role;
 use std::path::PathBuf;
@@ -63,8 +64,8 @@ pub(crate) struct Jobs {
     #[arg(long)]
     pub(crate) failed: bool,
     /// Only of this collection
-    #[arg(long, short, value_name = "NAME")]
-    pub(crate) collection: Option<String>,
+    #[command(flatten)]
+    pub(crate) of: OneCollection,
     /// At most this many jobs, the newest
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
@@ -76,6 +77,25 @@ pub(crate) struct Retry {
     /// The job, as `coseg jobs --failed` lists it
     pub(crate) job: u64,
     /// Return when its failed shapes are queued
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+}
+
+/// `coseg cancel`
+#[derive(Debug, Args)]
+pub(crate) struct Cancel {
+    /// The jobs, as `coseg jobs` lists them
+    #[arg(value_name = "JOB", required_unless_present = "collection")]
+    pub(crate) jobs: Vec<u64>,
+    /// Every job of this collection that is not finished
+    #[arg(long, short, value_name = "NAME", conflicts_with = "jobs")]
+    pub(crate) collection: Option<String>,
+}
+
+/// `coseg stop`
+#[derive(Debug, Args)]
+pub(crate) struct Stop {
+    /// Return when the daemon has been told, not when it has ended
     #[arg(long)]
     pub(crate) no_wait: bool,
 }

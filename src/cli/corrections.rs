@@ -1,6 +1,6 @@
 //! What a person types to correct labels.
 
-use super::InCollection;
+use super::{InCollection, OneCollection};
 use clap::Args;
 use std::path::PathBuf;
 
@@ -18,9 +18,9 @@ pub(crate) struct Correct {
     /// Label one part, numbered from 0 as `coseg show` lists them, instead of reading a file
     #[arg(long, value_name = "N", requires = "label", conflicts_with = "labels")]
     pub(crate) part: Option<u32>,
-    /// The label of that part
-    #[arg(long, value_name = "ID", requires = "part")]
-    pub(crate) label: Option<u32>,
+    /// The label of that part: an id, or the name of a label that is there
+    #[arg(long, value_name = "LABEL", requires = "part")]
+    pub(crate) label: Option<String>,
     /// Return when the correction is durable, not when it is carried to the other shapes
     #[arg(long)]
     pub(crate) no_wait: bool,
@@ -29,10 +29,10 @@ pub(crate) struct Correct {
 /// `coseg merge`
 #[derive(Debug, Args)]
 pub(crate) struct Merge {
-    /// The label that goes
-    pub(crate) label: u32,
-    /// The label that stands for both
-    pub(crate) into: u32,
+    /// The label that goes: its id or name
+    pub(crate) label: String,
+    /// The label that stands for both: its id or name
+    pub(crate) into: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
 }
@@ -40,8 +40,8 @@ pub(crate) struct Merge {
 /// `coseg split`
 #[derive(Debug, Args)]
 pub(crate) struct Split {
-    /// The label to split; it keeps the larger share
-    pub(crate) label: u32,
+    /// The label to split, its id or name; it keeps the larger share
+    pub(crate) label: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
     /// Return when the label is split, not when all shapes are labelled anew
@@ -53,7 +53,7 @@ pub(crate) struct Split {
 #[derive(Debug, Args)]
 pub(crate) struct Undo {
     #[command(flatten)]
-    pub(crate) within: InCollection,
+    pub(crate) of: OneCollection,
     /// Return when the change is undone, not when shapes that came since are labelled anew
     #[arg(long)]
     pub(crate) no_wait: bool,
@@ -63,7 +63,7 @@ pub(crate) struct Undo {
 #[derive(Debug, Args)]
 pub(crate) struct Suggest {
     #[command(flatten)]
-    pub(crate) within: InCollection,
+    pub(crate) of: OneCollection,
     /// Do not wait for shapes and relabellings that are queued
     #[arg(long)]
     pub(crate) no_wait: bool,
@@ -72,11 +72,8 @@ pub(crate) struct Suggest {
 /// `coseg render`
 #[derive(Debug, Args)]
 pub(crate) struct Render {
-    /// The collection; may be left out if there is only one
-    #[arg(value_name = "COLLECTION", conflicts_with = "collection")]
-    pub(crate) name: Option<String>,
     #[command(flatten)]
-    pub(crate) within: InCollection,
+    pub(crate) of: OneCollection,
     /// The PNG file to write
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: PathBuf,

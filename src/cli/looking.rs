@@ -1,17 +1,14 @@
 //! What a person types to look at a library or at the daemon.
 
-use super::InCollection;
+use super::OneCollection;
 use clap::Args;
 use std::path::PathBuf;
 
 /// `coseg view`
 #[derive(Debug, Args)]
 pub(crate) struct View {
-    /// The collection; may be left out if there is only one
-    #[arg(value_name = "COLLECTION", conflicts_with = "collection")]
-    pub(crate) name: Option<String>,
     #[command(flatten)]
-    pub(crate) within: InCollection,
+    pub(crate) of: OneCollection,
     /// The HTML file to write
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: PathBuf,

@@ -3,18 +3,18 @@
 //! Files are sent in batches, a few jobs ahead of the one being waited for, so that the daemon always
 //! has something to describe. The same command again resumes: what is there is `unchanged`.
 
+use super::mesh_files::{self, Found, MeshFile, printable};
 use super::session::{Session, ambiguous, bar};
-use super::{CommandError, Outcome, json};
+use super::{CommandError, Outcome, interrupt, json};
 use crate::cli::Add;
 use bytes::Bytes;
 use coseg::ipc::client::unexpected;
 use coseg::ipc::convert::mesh_format;
+use coseg::ipc::size;
 use coseg::ipc::wire::{self, ItemState, reply, request, shape_input::Source};
-use coseg::mesh::Format;
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::collections::{HashMap, VecDeque};
-use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Shapes and bytes of one request: small enough that the first is at work while the next is read.
@@ -24,19 +24,6 @@ const BATCH_BYTES: u64 = 16 << 20;
 const JOBS_AHEAD: usize = 4;
 /// Name of the collection that is created when none is named and there is none.
 const DEFAULT_COLLECTION: &str = "default";
-/// What lies beside meshes and is passed over without a word.
-const BESIDE_MESHES: [&str; 16] = [
-    "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg",
-    "npy", "npz", "html",
-];
-
-/// A mesh file to send.
-#[derive(Debug, PartialEq)]
-struct MeshFile {
-    path: PathBuf,
-    name: String,
-    format: Format,
-}
 
 /// What became of the files so far.
 struct Report {
@@ -49,7 +36,14 @@ struct Report {
 
 pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     let begin = Instant::now();
-    let files = mesh_files(&args.paths)?;
+    let Found {
+        files,
+        refused,
+        notes,
+    } = mesh_files::find(&args.paths, args.recursive)?;
+    for note in notes {
+        eprintln!("coseg: {note}");
+    }
     let collection = match &args.collection {
         Some(name) => name.clone(),
         None => {
@@ -63,11 +57,14 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     let limits = session.client.hello()?.limits.unwrap_or_default();
     let mut report = Report {
         json: session.json,
-        bar: bar(files.len() as u64),
+        bar: bar((files.len() + refused.len()) as u64),
         shapes: Vec::new(),
         counts: HashMap::new(),
         n_failed: 0,
     };
+    for (path, why) in refused {
+        report.refused(&printable(&path), &why);
+    }
     // A batch that the whole queue cannot hold would be refused for ever.
     let max_queued = usize::try_from(limits.max_queued_shapes).unwrap_or(usize::MAX);
     let max_shapes = BATCH_SHAPES
@@ -87,11 +84,11 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
         };
         let n_bytes = bytes.len() as u64;
         if n_bytes > limits.max_shape_bytes {
-            let limit = limits.max_shape_bytes;
-            report.refused(
-                &file.name,
-                &format!("the file has {n_bytes} bytes, the limit is {limit}"),
+            let (limit, key) = (
+                limits.max_shape_bytes,
+                "limits.max_shape, within limits.memory",
             );
+            report.refused(&file.name, &size::beyond("the file", n_bytes, limit, key));
             continue;
         }
         if batch.shapes.len() == max_shapes || batch.n_bytes + n_bytes > max_bytes {
@@ -160,7 +157,20 @@ fn send(
         (reply::Result::AddShapes(reply), _) => jobs.push_back((reply.job_id, n)),
         (other, _) => return Err(unexpected(&other).into()),
     }
+    interrupt::say(left_behind(collection, jobs));
     Ok(())
+}
+
+/// What goes on in the daemon when the command ends now.
+fn left_behind(collection: &str, jobs: &VecDeque<(u64, usize)>) -> String {
+    let n: usize = jobs.iter().map(|(_, n)| n).sum();
+    let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
+    let ids = ids.join(" ");
+    format!(
+        "coseg: interrupted; the daemon goes on with what it accepted: up to {n} shapes of {collection:?}, jobs {ids}\n  \
+         to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel {ids}\n  \
+         to add the rest: the same command again"
+    )
 }
 
 /// Waits for the oldest job and reports its shapes as they come, in order.
@@ -169,7 +179,7 @@ fn finish_job(
     session: &mut Session,
     report: &mut Report,
 ) -> Result<(), CommandError> {
-    let Some((job_id, _)) = jobs.pop_front() else {
+    let Some(&(job_id, _)) = jobs.front() else {
         return Ok(());
     };
     let (mut revision, mut n_reported) = (0, 0);
@@ -190,6 +200,11 @@ fn finish_job(
             }
         }
         if job.finished {
+            jobs.pop_front();
+            interrupt::forget();
+            if !jobs.is_empty() {
+                interrupt::say(left_behind(&job.collection, jobs));
+            }
             return Ok(());
         }
     }
@@ -211,7 +226,9 @@ fn accepted(
             "n_failed": n_failed,
         }))?;
     } else {
-        eprintln!("{n} shapes accepted into {collection}");
+        let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
+        let ids = ids.join(" ");
+        eprintln!("{n} shapes accepted into {collection}, jobs {ids}");
     }
     Ok(n_failed == 0)
 }
@@ -283,154 +300,5 @@ impl Report {
             eprintln!("{collection}: {} in {seconds:.1} s", counted.join(", "));
         }
         Ok(self.n_failed == 0)
-    }
-}
-
-/// The files to send, in order: as named, the files of a folder as people count.
-fn mesh_files(paths: &[PathBuf]) -> Result<Vec<MeshFile>, CommandError> {
-    let mut files = Vec::new();
-    for path in paths {
-        if path.is_dir() {
-            let n = files.len();
-            folder(path, &mut files)?;
-            if files.len() == n {
-                let (path, known) = (path.display(), Format::EXTENSIONS);
-                let text = format!("{path} has no mesh files ({known})");
-                return Err(CommandError::Usage(text));
-            }
-        } else if !path.exists() {
-            return Err(CommandError::Usage(format!(
-                "{} does not exist",
-                path.display()
-            )));
-        } else {
-            let file = mesh_file(path)?.ok_or_else(|| {
-                let (path, known) = (path.display(), Format::EXTENSIONS);
-                let text = format!("{path} is not a mesh file ({known})");
-                CommandError::Usage(text)
-            })?;
-            files.push(file);
-        }
-    }
-    let mut first = HashMap::new();
-    for file in &files {
-        if let Some(other) = first.insert(&file.name, &file.path) {
-            return Err(CommandError::Usage(format!(
-                "{} and {} would both be named {:?}",
-                other.display(),
-                file.path.display(),
-                file.name
-            )));
-        }
-    }
-    Ok(files)
-}
-
-fn folder(path: &Path, files: &mut Vec<MeshFile>) -> Result<(), CommandError> {
-    let at = |source| CommandError::File {
-        path: path.display().to_string(),
-        source,
-    };
-    let entries = std::fs::read_dir(path).map_err(at)?;
-    let mut names: Vec<String> = Vec::new();
-    for entry in entries {
-        let entry = entry.map_err(at)?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        if !name.starts_with('.') && !entry.path().is_dir() {
-            names.push(name);
-        }
-    }
-    // By bytes first: natural order alone does not tell `a01` from `a1`.
-    names.sort();
-    names.sort_by(|a, b| natord::compare(a, b));
-    for name in names {
-        match mesh_file(&path.join(&name))? {
-            Some(file) => files.push(file),
-            None if is_beside_meshes(&name) => {}
-            None => {
-                let known = Format::EXTENSIONS;
-                eprintln!("coseg: {name} is skipped, it is not a mesh file ({known})");
-            }
-        }
-    }
-    Ok(())
-}
-
-fn is_beside_meshes(name: &str) -> bool {
-    let extension = name.rsplit_once('.').map(|(_, e)| e.to_ascii_lowercase());
-    extension.is_none_or(|e| BESIDE_MESHES.contains(&e.as_str()))
-}
-
-/// The file, if its extension says that it is a mesh.
-fn mesh_file(path: &Path) -> Result<Option<MeshFile>, CommandError> {
-    let not_text =
-        || CommandError::Usage(format!("the name of {} is not valid UTF-8", path.display()));
-    let name = path
-        .file_name()
-        .map(|n| n.to_string_lossy())
-        .unwrap_or_default();
-    let Some(format) = Format::from_name(&name) else {
-        return Ok(None);
-    };
-    let stem = path
-        .file_stem()
-        .and_then(|s| s.to_str())
-        .ok_or_else(not_text)?;
-    Ok(Some(MeshFile {
-        path: path.to_owned(),
-        name: stem.to_owned(),
-        format,
-    }))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{CommandError, mesh_files};
-
-    #[test]
-    fn a_folder_is_read_in_natural_order_and_other_files_are_skipped() {
-        let folder = tempfile::tempdir().unwrap();
-        for name in [
-            "10.off",
-            "9.OBJ",
-            "9.labels.txt",
-            "11.Glb",
-            "12.gltf",
-            "13.stl",
-            "14.PLY",
-            "1.off",
-            "x.step",
-            ".hidden.off",
-            "readme",
-        ] {
-            std::fs::write(folder.path().join(name), "").unwrap();
-        }
-        let files = mesh_files(&[folder.path().to_owned()]).unwrap();
-        let names: Vec<_> = files.iter().map(|f| f.name.as_str()).collect();
-        assert_eq!(names, ["1", "9", "10", "11", "12", "13", "14"]);
-    }
-
-    #[test]
-    fn argument_order_is_kept_and_double_names_are_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = |name: &str| folder.path().join(name);
-        for name in ["b.off", "a.off", "a.obj", "c.txt"] {
-            std::fs::write(path(name), "").unwrap();
-        }
-        let files = mesh_files(&[path("b.off"), path("a.obj")]).unwrap();
-        assert_eq!(
-            files.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(),
-            ["b", "a"]
-        );
-        for paths in [
-            vec![path("a.off"), path("a.obj")],
-            vec![path("c.txt")],
-            vec![path("none.off")],
-        ] {
-            assert!(
-                matches!(mesh_files(&paths), Err(CommandError::Usage(_))),
-                "{paths:?}"
-            );
-        }
     }
 }

@@ -41,10 +41,10 @@ pub(crate) fn restore(args: &Restore, global: &Global) -> Outcome {
 fn copy(from: &Path, to: &Path, link: bool, as_json: bool) -> Outcome {
     let copied = Library::copy(from, to, link)?;
     eprintln!(
-        "{}: {} files, {} bytes",
+        "{}: {} files, {}",
         to.display(),
         copied.n_files,
-        copied.n_bytes
+        coseg::ipc::size::in_words(copied.n_bytes)
     );
     report(to, &copied.findings, None, as_json)
 }

@@ -12,7 +12,7 @@ use serde_json::json;
 pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
     let mut frames = FrameWriter::default();
-    let correction = match (&args.labels, args.part, args.label) {
+    let correction = match (&args.labels, args.part, &args.label) {
         (Some(path), ..) => {
             let labels = label_file::read(path)?;
             let request = wire::GetShapeRequest {
@@ -31,7 +31,10 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             }
             Correction::Labels(frames.i32_array(&labels, &[labels.len()]))
         }
-        (None, Some(part), Some(label)) => Correction::Part(wire::LabelledPart { part, label }),
+        (None, Some(part), Some(label)) => {
+            let label = session.label(&collection, label)?;
+            Correction::Part(wire::LabelledPart { part, label })
+        }
         (None, ..) => unreachable!("invariant: clap requires a file, or part and label"),
     };
     let request = wire::CorrectLabelsRequest {

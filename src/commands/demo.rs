@@ -5,7 +5,7 @@
 
 use super::session::{Session, print_line, table};
 use super::{CommandError, Outcome, demo_ply, json, labels};
-use crate::cli::{Global, Settings};
+use crate::cli::{Global, Settings, parts};
 use crate::telemetry;
 use bytes::Bytes;
 use clap::Args;
@@ -51,7 +51,7 @@ pub(crate) struct DemoArgs {
     #[arg(long)]
     rotate: bool,
     /// Number of part kinds the daemon is told; 0: it estimates [default: as many as the family has]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parts, allow_hyphen_values = true)]
     parts: Option<u32>,
     /// Folder for the coloured meshes, created if missing [default: a new one for temporary files]
     #[arg(long, value_name = "DIR")]

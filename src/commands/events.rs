@@ -36,7 +36,7 @@ pub(crate) fn since(
 }
 
 pub(crate) fn run(args: &Events, mut session: Session) -> Outcome {
-    let collection = session.collection(&args.within)?;
+    let collection = session.collection(&args.of.within())?;
     let events = since(&mut session, &collection, args.since, args.limit)?;
     if session.json {
         let list: Vec<Value> = events.iter().map(json::event).collect();

@@ -1,8 +1,9 @@
-//! `coseg jobs` and `coseg retry`: what became of what was added, and trying again what failed.
+//! `coseg jobs`, `coseg retry` and `coseg cancel`: what became of what was added, and trying again
+//! or giving up.
 
 use super::session::{Session, table};
-use super::{CommandError, Outcome};
-use crate::cli::{Jobs, Retry};
+use super::{CommandError, Outcome, interrupt};
+use crate::cli::{Cancel, Jobs, Retry};
 use coseg::call;
 use coseg::ipc::wire::{self, ItemState};
 use coseg::library::shown;
@@ -16,7 +17,7 @@ pub(crate) fn jobs(args: &Jobs, mut session: Session) -> Outcome {
             failed: args.failed,
             before,
             page_size: 0,
-            collection: args.collection.clone().unwrap_or_default(),
+            collection: args.of.named().cloned().unwrap_or_default(),
         };
         let reply = call!(session.client, ListJobs(request))?;
         before = reply.jobs.last().map_or(0, |j| j.job_id);
@@ -83,9 +84,18 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
     let reply = call!(session.client, RetryJob(request))?;
     let mut job = reply.job.unwrap_or_default();
     let mut revision = 0;
+    if !args.no_wait && !job.finished {
+        let id = args.job;
+        interrupt::say(format!(
+            "coseg: interrupted; the daemon goes on with job {id}\n  to follow: coseg wait -c {:?}\n  \
+             to cancel: coseg cancel {id}",
+            job.collection
+        ));
+    }
     while !args.no_wait && !job.finished {
         job = session.watch_job(args.job, &mut revision)?;
     }
+    interrupt::forget();
     let failed: Vec<_> = job
         .items
         .iter()
@@ -106,6 +116,73 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
         )));
     }
     Ok(args.no_wait || failed.is_empty())
+}
+
+pub(crate) fn cancel(args: &Cancel, mut session: Session) -> Outcome {
+    let jobs = match &args.collection {
+        Some(collection) => unfinished(collection, &mut session)?,
+        None => args.jobs.clone(),
+    };
+    let mut cancelled = Vec::new();
+    for job_id in jobs {
+        let request = wire::CancelJobRequest { job_id };
+        let job = call!(session.client, CancelJob(request))?.job;
+        let job = job.unwrap_or_default();
+        if !session.json {
+            eprintln!("{}", after_cancelling(&job));
+        }
+        cancelled.push(to_json(&job));
+    }
+    if session.json {
+        session.print_json(&json!({ "jobs": cancelled }))?;
+    } else if cancelled.is_empty() {
+        eprintln!("no job is unfinished, so nothing was cancelled");
+    }
+    Ok(true)
+}
+
+/// Jobs with shapes that are not placed yet, the oldest first.
+fn unfinished(collection: &str, session: &mut Session) -> Result<Vec<u64>, CommandError> {
+    // A misspelt name would find no jobs, and no fault.
+    session.describe(collection)?;
+    let (mut found, mut before) = (Vec::new(), 0);
+    loop {
+        let request = wire::ListJobsRequest {
+            failed: false,
+            before,
+            page_size: 0,
+            collection: collection.to_owned(),
+        };
+        let reply = call!(session.client, ListJobs(request))?;
+        before = reply.jobs.last().map_or(0, |j| j.job_id);
+        let open = reply
+            .jobs
+            .iter()
+            .filter(|j| !j.finished && j.carrying.is_none());
+        found.extend(open.map(|j| j.job_id));
+        if !reply.more {
+            found.reverse();
+            return Ok(found);
+        }
+    }
+}
+
+/// `job 7 of "chairs": 3 cancelled, 2 done`.
+fn after_cancelling(job: &wire::Job) -> String {
+    let states = [
+        (ItemState::Cancelled, "cancelled"),
+        (ItemState::Done, "done before that"),
+        (ItemState::Failed, "failed"),
+        (ItemState::Running, "still in work"),
+        (ItemState::Queued, "queued"),
+    ];
+    let counted = states.map(|(state, word)| {
+        let n = job.items.iter().filter(|i| i.state() == state).count();
+        (n > 0).then(|| format!("{n} {word}"))
+    });
+    let counted: Vec<String> = counted.into_iter().flatten().collect();
+    let (id, collection) = (job.job_id, &job.collection);
+    format!("job {id} of {collection:?}: shapes {}", counted.join(", "))
 }
 
 fn why(item: &wire::JobItem) -> String {

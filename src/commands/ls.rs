@@ -8,10 +8,13 @@ use coseg::ipc::wire;
 use serde_json::{Value, json};
 
 pub(crate) fn run(args: &Ls, mut session: Session) -> Outcome {
-    match &args.collection {
-        Some(collection) => shapes(collection, args.label, &mut session),
-        None => collections(&mut session),
+    if args.of.named().is_none() && args.label.is_none() {
+        return collections(&mut session);
     }
+    let collection = session.collection(&args.of.within())?;
+    let label = args.label.as_ref();
+    let label = label.map(|l| session.label(&collection, l)).transpose()?;
+    shapes(&collection, label, &mut session)
 }
 
 fn collections(session: &mut Session) -> Outcome {

@@ -8,17 +8,19 @@ use coseg::ipc::wire;
 use serde_json::json;
 
 pub(crate) fn merge(args: &Merge, mut session: Session) -> Outcome {
+    let collection = session.collection(&args.within)?;
+    let label = session.label(&collection, &args.label)?;
+    let into = session.label(&collection, &args.into)?;
     let request = wire::MergeLabelsRequest {
-        collection: session.collection(&args.within)?,
-        label: args.label,
-        into: args.into,
+        collection,
+        label,
+        into,
     };
     let done = call!(session.client, MergeLabels(request))?;
     if session.json {
         let label = json::label(&done.label.unwrap_or_default());
         session.print_json(&json!({ "label": label, "n_shapes": done.n_shapes }))?;
     } else {
-        let (label, into) = (args.label, args.into);
         eprintln!("label {label} is {into} now, on {} shapes", done.n_shapes);
     }
     Ok(true)
@@ -26,9 +28,10 @@ pub(crate) fn merge(args: &Merge, mut session: Session) -> Outcome {
 
 pub(crate) fn split(args: &Split, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
+    let split = session.label(&collection, &args.label)?;
     let request = wire::SplitLabelRequest {
         collection: collection.clone(),
-        label: args.label,
+        label: split,
     };
     let done = call!(session.client, SplitLabel(request))?;
     if !args.no_wait {
@@ -39,10 +42,7 @@ pub(crate) fn split(args: &Split, mut session: Session) -> Outcome {
         session.print_json(&json::label(&label))?;
     } else {
         session.line(&label.id.to_string())?;
-        eprintln!(
-            "label {} is {} and {} now",
-            args.label, args.label, label.id
-        );
+        eprintln!("label {split} is {split} and {} now", label.id);
     }
     Ok(true)
 }

@@ -5,6 +5,7 @@ mod check;
 mod collections;
 mod completions;
 mod config;
+mod confirm;
 mod correct;
 pub(crate) mod demo;
 mod demo_ply;
@@ -13,6 +14,7 @@ mod describe_full;
 mod events;
 mod export;
 mod export_mesh;
+mod interrupt;
 mod jobs;
 mod keys;
 mod label_file;
@@ -21,6 +23,7 @@ mod ls;
 mod man;
 mod map;
 mod merge;
+mod mesh_files;
 mod name;
 mod nearest;
 mod npy;
@@ -130,7 +133,7 @@ impl CommandError {
         };
         Some(match refusal.reason() {
             ErrorReason::NoCollection => "`coseg ls` lists the collections",
-            ErrorReason::NoShape => "`coseg ls --collection NAME` lists the shapes",
+            ErrorReason::NoShape => "`coseg ls NAME` lists the shapes of a collection",
             ErrorReason::NoLabel | ErrorReason::LabelMerged => {
                 "`coseg show --collection NAME` lists the labels"
             }
@@ -140,7 +143,6 @@ impl CommandError {
                 "look at the daemon's log, then run `coseg check`"
             }
             ErrorReason::NoSpace => "make room on the disk of the library; nothing was lost",
-            ErrorReason::MeshTooLarge => "`coseg config show` has limits.max_shape",
             _ => return None,
         })
     }
@@ -196,6 +198,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Demo(args) => demo::run(args, &cli.global),
         Command::Jobs(args) => jobs::jobs(args, session()?),
         Command::Retry(args) => jobs::retry(args, session()?),
+        Command::Cancel(args) => jobs::cancel(args, session()?),
         Command::Keys(args) => keys::run(args, &cli.global),
         Command::Worker => return Ok(coseg::daemon::run_worker()),
         Command::View(args) => view::run(args, session()?),
@@ -203,7 +206,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Top(args) => top::run(args, session()?),
         Command::Completions { shell } => completions::run(*shell),
         Command::Man { out } => man::run(out.as_deref()),
-        Command::Stop => stop::run(session()?),
+        Command::Stop(args) => stop::run(args, session()?),
     }?;
     Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))
 }

@@ -8,9 +8,10 @@ use coseg::ipc::wire;
 
 pub(crate) fn run(args: &Name, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
+    let label = session.label(&collection, &args.label)?;
     let request = wire::NameLabelRequest {
         collection,
-        label: args.label,
+        label,
         name: args.name.clone(),
     };
     let label = call!(session.client, NameLabel(request))?
@@ -18,6 +19,8 @@ pub(crate) fn run(args: &Name, mut session: Session) -> Outcome {
         .unwrap_or_default();
     if session.json {
         session.print_json(&json::label(&label))?;
+    } else {
+        eprintln!("label {} is named {:?}", label.id, label.name);
     }
     Ok(true)
 }

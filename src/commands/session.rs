@@ -1,12 +1,13 @@
 //! A client with what every command needs: which collection is meant, waiting, printing.
 
-use super::CommandError;
-use crate::cli::{Global, InCollection};
+use super::{CommandError, interrupt};
+use crate::cli::{Global, InCollection, OneCollection};
 use coseg::call;
 use coseg::ipc::client::Client;
 use coseg::ipc::endpoint::Endpoint;
 use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
 use coseg::ipc::wire;
+use coseg::library::likely::{did_you_mean, likeliest};
 use coseg::library::shown;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::Value;
@@ -27,7 +28,7 @@ impl Session {
     pub(crate) fn open(global: &Global) -> Result<Self, CommandError> {
         let uri = match &global.endpoint {
             Some(uri) => uri.clone(),
-            None => Endpoint::default_for_user().to_string(),
+            None => Endpoint::default_for_client()?.to_string(),
         };
         let keys = match (&global.server_key, &global.client_key) {
             (Some(server), Some(own)) => Some(ClientKeys {
@@ -104,6 +105,21 @@ impl Session {
             .collect())
     }
 
+    /// The id of the label that was typed: an id, or the name of a label in use.
+    pub(crate) fn label(&mut self, collection: &str, typed: &str) -> Result<u32, CommandError> {
+        if !typed.is_empty() && typed.bytes().all(|b| b.is_ascii_digit()) {
+            let id = typed.parse();
+            return id.map_err(|_| {
+                CommandError::Usage(format!(
+                    "{typed} is not a label id, which is at most {}",
+                    u32::MAX
+                ))
+            });
+        }
+        let labels = self.describe(collection)?.labels;
+        label_named(typed, &labels).map_err(CommandError::Failed)
+    }
+
     /// One collection.
     pub(crate) fn describe(&mut self, name: &str) -> Result<wire::Collection, CommandError> {
         let request = wire::DescribeCollectionRequest {
@@ -141,14 +157,10 @@ impl Session {
     /// The collection that is named, or the only one; idle, unless that is not to be waited for.
     pub(crate) fn settled_collection(
         &mut self,
-        name: Option<&String>,
-        within: &InCollection,
+        of: &OneCollection,
         no_wait: bool,
     ) -> Result<String, CommandError> {
-        let collection = match name {
-            Some(name) => name.clone(),
-            None => self.collection(within)?,
-        };
+        let collection = self.collection(&of.within())?;
         if !no_wait {
             self.wait_until_idle(&collection)?;
         }
@@ -165,9 +177,16 @@ impl Session {
             };
             let reply = call!(self.client, WaitIdle(request))?;
             if reply.idle {
+                interrupt::forget();
                 return Ok(());
             }
-            let bar = bar.get_or_insert_with(|| spinner("waiting"));
+            let bar = bar.get_or_insert_with(|| {
+                interrupt::say(format!(
+                    "coseg: interrupted; the daemon goes on with what is queued in {collection:?}\n  \
+                     to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel -c {collection:?}"
+                ));
+                spinner("waiting")
+            });
             bar.set_message(format!(
                 "{} shapes to place, {} to relabel",
                 reply.n_queued, reply.n_stale
@@ -193,6 +212,29 @@ pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
     writeln!(out, "{text}")
         .and_then(|()| out.flush())
         .map_err(CommandError::Output)
+}
+
+/// The label that has this name; one that was merged into another is out of use.
+fn label_named(name: &str, labels: &[wire::LabelInfo]) -> Result<u32, String> {
+    let in_use = || labels.iter().filter(|l| l.merged_into.is_none());
+    let has_it = |l: &&wire::LabelInfo| !name.is_empty() && l.name == name;
+    let ids: Vec<u32> = in_use().filter(has_it).map(|l| l.id).collect();
+    match ids[..] {
+        [id] => Ok(id),
+        [] => {
+            let names = in_use().map(|l| l.name.as_str()).filter(|n| !n.is_empty());
+            let meant = did_you_mean(likeliest(name, names));
+            Err(format!("no label is named {name:?}{meant}"))
+        }
+        _ => {
+            let ids: Vec<String> = ids.iter().map(u32::to_string).collect();
+            Err(format!(
+                "{} labels are named {name:?}, say which by its id: {}",
+                ids.len(),
+                ids.join(", ")
+            ))
+        }
+    }
 }
 
 /// Several collections could be meant.
@@ -245,7 +287,38 @@ fn spinner(message: &'static str) -> ProgressBar {
 
 #[cfg(test)]
 mod tests {
-    use super::table;
+    use super::{label_named, table};
+    use coseg::ipc::wire::LabelInfo;
+
+    #[test]
+    fn labels_are_found_by_name_if_one_has_it() {
+        let label = |id, name: &str, merged_into| LabelInfo {
+            id,
+            name: name.to_owned(),
+            merged_into,
+            ..LabelInfo::default()
+        };
+        let labels = [
+            label(0, "seat", None),
+            label(1, "leg", None),
+            label(2, "leg", Some(1)),
+            label(3, "back", None),
+            label(4, "back", None),
+            label(5, "", None),
+        ];
+        assert_eq!(label_named("leg", &labels), Ok(1));
+        for (name, said) in [
+            (
+                "back",
+                "2 labels are named \"back\", say which by its id: 3, 4",
+            ),
+            ("seta", "no label is named \"seta\"; did you mean \"seat\"?"),
+            ("wing", "no label is named \"wing\""),
+        ] {
+            assert_eq!(label_named(name, &labels), Err(said.to_owned()));
+        }
+        assert!(label_named("", &labels).is_err());
+    }
 
     #[test]
     fn columns_line_up() {

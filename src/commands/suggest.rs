@@ -8,7 +8,7 @@ use coseg::ipc::wire;
 use serde_json::json;
 
 pub(crate) fn run(args: &Suggest, mut session: Session) -> Outcome {
-    let collection = session.collection(&args.within)?;
+    let collection = session.collection(&args.of.within())?;
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
     }

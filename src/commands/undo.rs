@@ -8,7 +8,7 @@ use coseg::ipc::wire;
 use serde_json::json;
 
 pub(crate) fn run(args: &Undo, mut session: Session) -> Outcome {
-    let collection = session.collection(&args.within)?;
+    let collection = session.collection(&args.of.within())?;
     let request = wire::UndoRequest {
         collection: collection.clone(),
     };

@@ -18,7 +18,7 @@ const N_NEIGHBORS: u32 = 6;
 const N_MAPS: usize = 2;
 
 pub(crate) fn run(args: &View, mut session: Session) -> Outcome {
-    let collection = session.settled_collection(args.name.as_ref(), &args.within, args.no_wait)?;
+    let collection = session.settled_collection(&args.of, args.no_wait)?;
     let about = session.describe(&collection)?;
     let mut shapes = session.shapes(&collection, None)?;
     let n_stored = shapes.len();

@@ -2,13 +2,13 @@
 
 use super::Outcome;
 use super::session::Session;
-use crate::cli::InCollection;
+use crate::cli::Wait;
 use serde_json::json;
 use std::time::Instant;
 
-pub(crate) fn run(args: &InCollection, mut session: Session) -> Outcome {
+pub(crate) fn run(args: &Wait, mut session: Session) -> Outcome {
     let begin = Instant::now();
-    let collection = session.collection(args)?;
+    let collection = session.collection(&args.of.within())?;
     session.wait_until_idle(&collection)?;
     if session.json {
         let seconds = begin.elapsed().as_secs_f64();

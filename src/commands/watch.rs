@@ -9,6 +9,7 @@ use crate::cli::Watch;
 use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::wire::{self, event::Kind};
+use coseg::library::likely::{did_you_mean, likeliest};
 use prost::Message as _;
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -65,7 +66,11 @@ impl Printer {
 }
 
 pub(crate) fn run(args: &Watch, mut session: Session) -> Outcome {
-    let socket = session.client.subscribe(args.collection.as_deref())?;
+    let only = match args.since {
+        Some(_) => Some(session.collection(&args.of.within())?),
+        None => args.of.named().cloned(),
+    };
+    let socket = session.client.subscribe(only.as_deref())?;
     let silence = session.client.timeout().max(LEAST_SILENCE);
     let socket_error = |source| {
         CommandError::Client(ClientError::Socket {
@@ -78,13 +83,22 @@ pub(crate) fn run(args: &Watch, mut session: Session) -> Outcome {
     // After subscribing, so that nothing falls between.
     let mut printer = Printer {
         seen: BTreeMap::new(),
-        only: args.collection.clone(),
+        only: only.clone(),
         left: args.limit,
     };
     let reply = call!(
         session.client,
         ListCollections(wire::ListCollectionsRequest {})
     )?;
+    let known: Vec<_> = reply
+        .collections
+        .iter()
+        .filter_map(|c| c.spec.as_ref())
+        .collect();
+    if let Some(name) = only.filter(|only| known.iter().all(|s| s.name != **only)) {
+        let meant = did_you_mean(likeliest(&name, known.iter().map(|s| s.name.as_str())));
+        eprintln!("coseg: no collection named {name:?} yet{meant}");
+    }
     for c in reply.collections {
         let name = c.spec.unwrap_or_default().name;
         let begin = args

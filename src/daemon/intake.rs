@@ -10,6 +10,7 @@ use crate::daemon::writes::{Done, may_change, refuse};
 use crate::daemon::{Daemon, blocking};
 use crate::ipc::convert::{self, Source};
 use crate::ipc::frames::FrameReader;
+use crate::ipc::size::in_words;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply};
 use crate::library::{
     Job, KeptShapes, LibraryError, NewShape, RequestKey, Submission, check_shape_name,
@@ -298,25 +299,44 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
     let max_secs = limits.max_queued_seconds as f64;
     let max_shapes = limits.max_queued_shapes as f64;
     let max_bytes = limits.max_queued_bytes.0 as f64;
-    for (what, asked, queued, limit) in [
-        ("shapes", n as f64, load.n_shapes as f64, max_shapes),
-        ("bytes", bytes as f64, load.n_bytes as f64, max_bytes),
+    type Bound = (&'static str, fn(f64) -> String, f64, f64, f64);
+    let bounds: [Bound; 3] = [
+        (
+            "limits.max_queued_shapes",
+            |n| format!("{n} shapes"),
+            n as f64,
+            load.n_shapes as f64,
+            max_shapes,
+        ),
+        (
+            "limits.max_queued_bytes",
+            |n| in_words(n as u64),
+            bytes as f64,
+            load.n_bytes as f64,
+            max_bytes,
+        ),
         // An estimate alone refuses nothing for good: an empty queue takes whatever it says.
         (
-            "seconds of work",
+            "limits.max_queued_seconds",
+            |n| format!("{n} seconds of work"),
             secs.ceil().min(max_secs),
             load.seconds().floor(),
             max_secs,
         ),
-    ] {
+    ];
+    for (key, words, asked, queued, limit) in bounds {
         if asked > limit {
-            let text = format!("the request has {asked} {what}, the whole queue holds {limit}");
+            let (asked, limit) = (words(asked), words(limit));
+            let text = format!("the request has {asked}, the whole queue holds {limit} ({key})");
             let code = ErrorCode::InvalidArgument;
             return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
         }
         if queued + asked > limit {
+            let [queued_in_words, asked_in_words, limit_in_words] =
+                [queued, asked, limit].map(words);
             let text = format!(
-                "{queued} {what} are queued and {asked} more asked for, the limit is {limit}"
+                "{queued_in_words} are queued and {asked_in_words} more asked for, the limit is \
+                 {limit_in_words} ({key})"
             );
             let code = ErrorCode::ResourceExhausted;
             let mut error = convert::error(code, ErrorReason::QueueFull, text);

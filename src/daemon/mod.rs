@@ -252,7 +252,10 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let (notices, notices_out) = mpsc::unbounded_channel();
     let (asked_to_drain, control) = std::sync::mpsc::channel();
     let n_workers = config.n_workers();
-    library.store().share_lock().map_err(|e| opened(e.into()))?;
+    let store = library.store();
+    let said = store.tell_endpoint(&bound.endpoint.to_string());
+    said.and_then(|()| store.share_lock())
+        .map_err(|e| opened(e.into()))?;
     let pool = worker::Pool::new(&directory, n_workers).map_err(StartError::Worker)?;
     let daemon = Arc::new(Daemon {
         pool,

@@ -2,6 +2,7 @@
 
 use crate::config::Limits;
 use crate::daemon::fair::Client;
+use crate::ipc::size::in_words;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -62,12 +63,15 @@ impl Quotas {
             .map_or((0, 0), |c| (c.requests, c.bytes));
         if requests >= max_requests {
             return Err(format!(
-                "the client has {requests} requests in hand, the limit is {max_requests}"
+                "the client has {requests} requests in hand, the limit is {max_requests} \
+                 (limits.max_requests_per_client)"
             ));
         }
         if held.saturating_add(bytes) > max_bytes {
+            let [held, bytes, limit] = [held, bytes, max_bytes].map(in_words);
             return Err(format!(
-                "the client has {held} bytes in hand and sends {bytes} more, the limit is {max_bytes}"
+                "the client has {held} in hand and sends {bytes} more, the limit is {limit} \
+                 (limits.max_bytes_per_client)"
             ));
         }
         let mine = state.clients.entry(client.clone()).or_default();

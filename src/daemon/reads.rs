@@ -136,7 +136,7 @@ fn kept_map(
     frames: &mut FrameWriter,
 ) -> Result<Option<wire::GetFunctionalMapReply>, wire::Error> {
     let (collection, from, to) = (&r.collection, &r.from, &r.to);
-    Ok(match &r.points {
+    let found = match &r.points {
         Some(points) => library
             .kept_point_maps(collection, from, to, &convert::point_request(points))
             .map_err(refuse)?
@@ -147,7 +147,10 @@ fn kept_map(
             .kept_map(collection, from, to)
             .map_err(refuse)?
             .map(|map| convert::functional_map(&map, frames)),
-    })
+    };
+    let Some(found) = found else { return Ok(None) };
+    let n1 = library.n_proxy_vertices(collection, from).map_err(refuse)?;
+    Ok(Some(convert::from_vertices(found, n1)))
 }
 
 fn refuse(e: LibraryError) -> wire::Error {

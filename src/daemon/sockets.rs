@@ -13,6 +13,7 @@ use crate::daemon::{Counters, StartError};
 use crate::ipc::convert;
 use crate::ipc::endpoint::{Endpoint, claim_socket};
 use crate::ipc::frames::{self, FrameLimits};
+use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, Request, reply};
 use bytes::Bytes;
 use prost::Message as _;
@@ -444,7 +445,8 @@ impl SocketThread {
             .max_bytes()
             .min(self.shared.memory.limit());
         if n_bytes > most {
-            let text = format!("the message has {n_bytes} bytes, the limit is {most}");
+            let key = "limits.max_bytes_per_client, limits.memory";
+            let text = size::beyond("the message", n_bytes, most, key);
             let error = invalid(ErrorReason::MessageTooLarge, text);
             return self.refuse(&peer, request.request_id, error);
         }

@@ -33,7 +33,7 @@ pub enum ClientError {
     Keys(#[from] KeyError),
     #[error("{}", .0.message)]
     Refused(Box<wire::Error>),
-    #[error("the message has {found} {what}, the daemon's limit is {limit}")]
+    #[error("{}", frames::too_large(what, *found, *limit))]
     TooLarge {
         what: &'static str,
         found: u64,

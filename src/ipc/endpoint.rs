@@ -1,10 +1,12 @@
 //! Endpoint URIs become checked addresses: where the daemon listens and where clients find it.
 
+use super::folder::{DefaultFolder, private_directory};
 use rustix::fs::OFlags;
 use std::fmt;
 use std::fs;
+use std::io::Write as _;
 use std::net::IpAddr;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
 /// Bytes of the path of a Unix socket, as the kernel's `sockaddr_un` has it, less the final NUL.
@@ -31,10 +33,12 @@ pub enum EndpointError {
          them only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
     )]
     NotLoopback { uri: String },
-    #[error("{path}: {message}")]
+    #[error("{path} {message}")]
     Directory { path: String, message: String },
-    #[error("{path} is in use by a running daemon")]
-    InUse { path: String },
+    #[error(
+        "{path} is in use by a running daemon{holder}; `coseg stop --endpoint ipc://{path}` ends it"
+    )]
+    InUse { path: String, holder: String },
     #[error("{path} exists and is not a socket")]
     NotASocket { path: String },
     #[error("{path}: {source}")]
@@ -128,17 +132,15 @@ impl Endpoint {
     /// `$RUNTIME_DIRECTORY/coseg.sock` under a service manager, else
     /// `$XDG_RUNTIME_DIR/coseg/coseg.sock`, else `/tmp/coseg-UID/coseg.sock`.
     pub fn default_for_user() -> Self {
-        let variable = |name| {
-            std::env::var_os(name)
-                .filter(|v| !v.is_empty())
-                .map(PathBuf::from)
-        };
-        let directory = variable("RUNTIME_DIRECTORY")
-            .or_else(|| variable("XDG_RUNTIME_DIR").map(|d| d.join("coseg")))
-            .unwrap_or_else(|| {
-                PathBuf::from(format!("/tmp/coseg-{}", rustix::process::getuid().as_raw()))
-            });
-        Self::Ipc(directory.join("coseg.sock"))
+        Self::Ipc(DefaultFolder::of_this_process().path().join("coseg.sock"))
+    }
+
+    /// The same for a client, which must not talk to whoever made that folder first: it belongs to
+    /// this user or to root, and nobody else may enter it; the folder of a service may let a group
+    /// in.
+    pub fn default_for_client() -> Result<Self, EndpointError> {
+        DefaultFolder::of_this_process().check()?;
+        Ok(Self::default_for_user())
     }
 
     /// Where events are published beside this endpoint: the path with `.events`, or the next port
@@ -210,6 +212,10 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .map_err(io(&lock_path))?;
     let in_use = || EndpointError::InUse {
         path: path.display().to_string(),
+        holder: match fs::read_to_string(&lock_path).map(|text| text.trim().parse()) {
+            Ok(Ok::<u32, _>(pid)) => format!(", process {pid}"),
+            _ => String::new(),
+        },
     };
     rustix::fs::flock(&lock, rustix::fs::FlockOperation::NonBlockingLockExclusive)
         .map_err(|_| in_use())?;
@@ -230,56 +236,20 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
             fs::remove_file(path).map_err(io(path))?;
         }
     }
+    tell_holder(&lock).map_err(io(&lock_path))?;
     Ok(lock)
 }
 
-/// Creates `directory` for its owner alone, or checks that no other user can put files there.
-fn private_directory(directory: &Path) -> Result<(), EndpointError> {
-    let name = || directory.display().to_string();
-    match fs::DirBuilder::new()
-        .mode(0o700)
-        .recursive(true)
-        .create(directory)
-    {
-        Ok(()) => {}
-        Err(source) => {
-            return Err(EndpointError::Io {
-                path: name(),
-                source,
-            });
-        }
+/// Writes this process's id for whoever finds the lock taken; what a daemon that ended has left there
+/// is never read. Not to a file that somebody else has put there: a folder may be open to others.
+fn tell_holder(mut lock: &fs::File) -> std::io::Result<()> {
+    let found = lock.metadata()?;
+    let is_ours = found.uid() == rustix::process::getuid().as_raw() && found.nlink() == 1;
+    if !is_ours || !found.is_file() {
+        return Ok(());
     }
-    let metadata = fs::metadata(directory).map_err(|source| EndpointError::Io {
-        path: name(),
-        source,
-    })?;
-    let refuse = |message: String| {
-        Err(EndpointError::Directory {
-            path: name(),
-            message,
-        })
-    };
-    let (uid, mode) = (rustix::process::getuid().as_raw(), metadata.mode() & 0o7777);
-    let sticky = mode & 0o1000 != 0;
-    if metadata.uid() != uid && !(metadata.uid() == 0 && (sticky || mode & 0o022 == 0)) {
-        return refuse(format!("belongs to user {}, not to {uid}", metadata.uid()));
-    }
-    // The predictable name below /tmp could have been prepared by anybody.
-    let well_known = directory.parent() == Some(Path::new("/tmp"))
-        && directory
-            .file_name()
-            .is_some_and(|n| n.to_string_lossy().starts_with("coseg-"));
-    if well_known && (mode & 0o077 != 0 || metadata.uid() != uid) {
-        return refuse(format!(
-            "has mode {mode:04o}, others may enter; expected 0700"
-        ));
-    }
-    if mode & 0o022 != 0 && !sticky {
-        return refuse(format!(
-            "has mode {mode:04o}, others may write; expected 0700"
-        ));
-    }
-    Ok(())
+    lock.set_len(0)?;
+    lock.write_all(std::process::id().to_string().as_bytes())
 }
 
 #[cfg(test)]
@@ -389,6 +359,28 @@ mod tests {
         assert!(path.exists());
         let _lock = claim_socket(&path).unwrap();
         assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_lock_that_leads_elsewhere_is_neither_followed_nor_written() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, victim) = (directory.path().join("s"), directory.path().join("victim"));
+        let lock = directory.path().join("s.lock");
+        std::fs::write(&victim, "precious").unwrap();
+        std::os::unix::fs::symlink(&victim, &lock).unwrap();
+        assert!(matches!(claim_socket(&path), Err(EndpointError::Io { .. })));
+        std::fs::remove_file(&lock).unwrap();
+        std::fs::hard_link(&victim, &lock).unwrap();
+        drop(claim_socket(&path).unwrap());
+        assert_eq!(std::fs::read_to_string(&victim).unwrap(), "precious");
+        std::fs::remove_file(&lock).unwrap();
+        let _lock = claim_socket(&path).unwrap();
+        let said = claim_socket(&path).unwrap_err().to_string();
+        let pid = std::process::id();
+        assert!(
+            said.contains(&format!("running daemon, process {pid}; ")),
+            "{said}"
+        );
     }
 
     #[test]

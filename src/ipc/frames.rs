@@ -21,7 +21,7 @@ pub struct FrameLimits {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum FrameError {
-    #[error("the message has {found} {what}, the limit is {limit}")]
+    #[error("{}", too_large(what, *found, *limit))]
     TooLarge {
         what: &'static str,
         found: u64,
@@ -84,6 +84,14 @@ impl FrameError {
             | Self::Type { field, .. }
             | Self::Axes { field, .. } => Some(field),
         }
+    }
+}
+
+/// That a message has too much of what there are `found`.
+pub(super) fn too_large(what: &str, found: u64, limit: u64) -> String {
+    match what {
+        "bytes" => super::size::beyond("the message", found, limit, "limits.max_message"),
+        _ => format!("the message has {found} {what}, the limit is {limit}"),
     }
 }
 
@@ -446,7 +454,7 @@ mod tests {
         assert_eq!((kept.len(), kept[0].len()), (1, 4));
         assert_eq!(
             error.to_string(),
-            "the message has 11 bytes, the limit is 10"
+            "the message has 11 bytes, the limit is 10 bytes (limits.max_message of the daemon's configuration)"
         );
         let (_, error) = message(&[1, 1, 1, 1]).unwrap_err();
         assert_eq!(

@@ -6,9 +6,11 @@
 pub mod client;
 pub mod convert;
 pub mod endpoint;
+mod folder;
 pub mod frames;
 pub mod json;
 pub mod keys;
+pub mod size;
 
 /// The messages of `proto/coseg/v1`, as generated.
 #[allow(missing_docs, unreachable_pub, clippy::all, rustdoc::all)]

@@ -15,7 +15,9 @@ use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader, Tx};
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
 /// Most part kinds a collection can be given.
-const MAX_PARTS: u32 = 64;
+/// Most kinds of parts that a collection can be told to have.
+pub const MAX_PARTS: u32 = 64;
+/// Characters of a shape's name.
 const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
 
 impl Library {
@@ -90,11 +92,7 @@ impl Library {
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
         let delete = |tx: &Tx<'_>| {
-            let row = tx.collection(name)?;
-            let row = row.ok_or_else(|| LibraryError::NotFound {
-                what: "collection",
-                name: name.into(),
-            })?;
+            let row = super::read::require_collection(tx, name)?;
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
             Ok(Vec::new())
@@ -179,10 +177,7 @@ pub(super) fn find_label(
         .labels(collection)?
         .into_iter()
         .find(|l| l.id == label);
-    found.ok_or_else(|| LibraryError::NotFound {
-        what: "label",
-        name: label.to_string(),
-    })
+    found.ok_or_else(|| LibraryError::not_found("label", label.to_string()))
 }
 
 /// A label with the number of shapes that carry it.

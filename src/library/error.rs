@@ -1,5 +1,6 @@
 //! Why an operation on the library failed.
 
+use super::likely::{did_you_mean, likeliest};
 use super::{Failure, FailureSubject};
 use crate::store::StoreError;
 
@@ -20,8 +21,13 @@ pub enum LibraryError {
         message: String,
         subject: FailureSubject,
     },
-    #[error("no {what} named {name:?}")]
-    NotFound { what: &'static str, name: String },
+    /// `nearest` is what was probably meant.
+    #[error("no {what} named {name:?}{}", did_you_mean(nearest.as_deref()))]
+    NotFound {
+        what: &'static str,
+        name: String,
+        nearest: Option<String>,
+    },
     #[error("{message}")]
     AlreadyExists {
         reason: &'static str,
@@ -40,6 +46,25 @@ pub enum LibraryError {
 }
 
 impl LibraryError {
+    /// There is nothing of that name.
+    pub(super) fn not_found(what: &'static str, name: impl Into<String>) -> Self {
+        Self::NotFound {
+            what,
+            name: name.into(),
+            nearest: None,
+        }
+    }
+
+    /// There is none of that name among `known`, of which one may have been meant.
+    pub(super) fn none_of(what: &'static str, name: &str, known: &[String]) -> Self {
+        let nearest = likeliest(name, known.iter().map(String::as_str));
+        Self::NotFound {
+            what,
+            name: name.to_owned(),
+            nearest: nearest.map(str::to_owned),
+        }
+    }
+
     pub(super) fn invalid(reason: &'static str, message: String) -> Self {
         Self::InvalidArgument { reason, message }
     }

@@ -40,6 +40,7 @@ pub mod isolate;
 mod jobs;
 mod lane;
 mod learnt;
+pub mod likely;
 mod merge;
 mod names;
 mod place;
@@ -55,6 +56,7 @@ mod types;
 
 pub use agreement::Disagreement;
 pub use apart::{HandedOver, state_from_json, state_to_json};
+pub use collections::MAX_PARTS;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
@@ -174,10 +176,7 @@ impl Library {
             .store
             .catalog()
             .read(|r| r.collection_by_id(row.id).map_err(LibraryError::from))?;
-        let row = row.ok_or(LibraryError::NotFound {
-            what: "collection",
-            name,
-        })?;
+        let row = row.ok_or_else(|| LibraryError::not_found("collection", name))?;
         let mut lane = match slot.take() {
             Some(lane) if lane.row == row => lane,
             _ => self.store.catalog().read(|r| Lane::load(r, row))?,
@@ -188,14 +187,9 @@ impl Library {
     }
 
     fn collection_row(&self, name: &str) -> Result<CollectionRow> {
-        let row = self
-            .store
+        self.store
             .catalog()
-            .read(|r| r.collection(name).map_err(LibraryError::from))?;
-        row.ok_or_else(|| LibraryError::NotFound {
-            what: "collection",
-            name: name.into(),
-        })
+            .read(|r| read::require_collection(r, name))
     }
 
     fn note(&self, placed: &Placed) {

@@ -18,6 +18,10 @@ use crate::store::rows::confidence_from_u8;
 use crate::store::{CollectionRow, Digest, LabelVersionRow, MappedDescription, Reader, ShapeRow};
 use std::sync::atomic::Ordering;
 
+/// Names among which one that was probably meant is looked for, so that a wrong name costs little
+/// in any library.
+const MAX_COMPARED: u32 = 5_000;
+
 impl Library {
     /// Shapes by ordinal, after `after_ordinal`, at most `limit`; with `label`, only those that carry it.
     ///
@@ -60,10 +64,9 @@ impl Library {
             })
         })?;
         let name = || format!("{} of shape {shape:?}", version.unwrap_or(row.version));
-        found.map(labels).ok_or_else(|| LibraryError::NotFound {
-            what: "version",
-            name: name(),
-        })
+        found
+            .map(labels)
+            .ok_or_else(|| LibraryError::not_found("version", name()))
     }
 
     /// The bytes of a shape as they were sent, and their format.
@@ -168,6 +171,15 @@ impl Library {
             confidence,
             quality,
         }))
+    }
+
+    /// Vertices of a shape's proxy.
+    ///
+    /// # Errors
+    /// There is no such shape, or its description is damaged.
+    pub fn n_proxy_vertices(&self, collection: &str, shape: &str) -> Result<usize> {
+        let (_, row) = self.shape_row(collection, shape)?;
+        Ok(self.known(row.id)?.mapped.view().vertices.len())
     }
 
     /// Which part of A matches which part of B under the map from A to B, by descending overlap, and how good the
@@ -405,21 +417,24 @@ impl Library {
         self.store.catalog().read(|r| {
             let row = require_collection(r, collection)?;
             let found = r.shape_by_name(row.id, shape)?;
-            let found = found.ok_or_else(|| LibraryError::NotFound {
-                what: "shape",
-                name: shape.into(),
-            })?;
-            Ok((row, found))
+            match found {
+                Some(found) => Ok((row, found)),
+                None => {
+                    let known = r.shape_names(row.id, MAX_COMPARED)?;
+                    Err(LibraryError::none_of("shape", shape, &known))
+                }
+            }
         })
     }
 }
 
-fn require_collection(reader: &Reader<'_>, name: &str) -> Result<CollectionRow> {
-    let row = reader.collection(name)?;
-    row.ok_or_else(|| LibraryError::NotFound {
-        what: "collection",
-        name: name.into(),
-    })
+/// The collection of that name; if there is none, the error says which may have been meant.
+pub(super) fn require_collection(reader: &Reader<'_>, name: &str) -> Result<CollectionRow> {
+    if let Some(row) = reader.collection(name)? {
+        return Ok(row);
+    }
+    let known = reader.collection_names(MAX_COMPARED)?;
+    Err(LibraryError::none_of("collection", name, &known))
 }
 
 fn labels(row: LabelVersionRow) -> Labels {

@@ -19,8 +19,6 @@ use std::cell::RefCell;
 use std::sync::PoisonError;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-const MAX_SHAPE_NAME: usize = 255;
-
 /// Shapes whose files are durable, and that count once they are submitted.
 #[derive(Debug, Default)]
 pub struct KeptShapes {
@@ -154,10 +152,7 @@ impl Library {
     pub fn job(&self, id: u64) -> Result<Job> {
         let (job, items) = self.store.catalog().read(|r| -> Result<_> {
             let job = r.job(id)?;
-            let job = job.ok_or_else(|| LibraryError::NotFound {
-                what: "job",
-                name: id.to_string(),
-            })?;
+            let job = job.ok_or_else(|| LibraryError::not_found("job", id.to_string()))?;
             Ok((job, r.job_items(id)?))
         })?;
         let carrying = if items.is_empty() {
@@ -335,11 +330,7 @@ impl Library {
         described: std::result::Result<Described, Failure>,
     ) -> Result<ItemState> {
         let Ok(collection) = self.collection_row(&item.collection) else {
-            let name = item.collection.clone();
-            let gone = LibraryError::NotFound {
-                what: "collection",
-                name,
-            };
+            let gone = LibraryError::not_found("collection", &item.collection);
             return self.fail(item, failure(&gone));
         };
         self.with_lane(collection, |lane| {
@@ -448,9 +439,9 @@ impl Library {
             .store
             .catalog()
             .read(|r| r.job_item(item.job, item.index).map_err(LibraryError::from))?;
-        row.ok_or_else(|| LibraryError::NotFound {
-            what: "job item",
-            name: format!("{} of job {}", item.index, item.job),
+        row.ok_or_else(|| {
+            let name = format!("{} of job {}", item.index, item.job);
+            LibraryError::not_found("job item", name)
         })
     }
 

@@ -40,8 +40,8 @@ pub enum StoreError {
     Array(#[from] super::mapped::ArrayFileError),
     #[error("catalog: {0}")]
     Catalog(rusqlite::Error),
-    #[error("{path} is held by another process")]
-    Locked { path: String },
+    #[error("{path} is held by {holder}")]
+    Locked { path: String, holder: String },
     #[error("{path} has store format {found}, this version reads {supported}")]
     Version {
         path: String,

@@ -5,7 +5,8 @@ use rustix::fs::{FlockOperation, flock};
 use rustix::io::{FdFlags, fcntl_setfd};
 use rustix::process::{Pid, test_kill_process};
 use std::fs::File;
-use std::io::{self, Write};
+use std::io;
+use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -58,17 +59,28 @@ impl LibraryLock {
                 Err(rustix::io::Errno::WOULDBLOCK) => {
                     return Err(StoreError::Locked {
                         path: dir.display().to_string(),
+                        holder: Holder::read(&path).in_words(),
                     });
                 }
                 Err(errno) => return Err(StoreError::io(&path, errno.into())),
             }
         }
-        let mut lock = Self { file };
-        lock.file
-            .set_len(0)
-            .and_then(|()| writeln!(lock.file, "{}", std::process::id()))
-            .map_err(|e| StoreError::io(&path, e))?;
+        let lock = Self { file };
+        lock.write("").map_err(|e| StoreError::io(&path, e))?;
         Ok(lock)
+    }
+
+    /// Tells whoever finds the library held where the holder can be asked.
+    pub(super) fn tell(&self, endpoint: &str) -> std::io::Result<()> {
+        self.write(endpoint)
+    }
+
+    /// The process id on the first line, the endpoint, if there is one, on the second: one write,
+    /// so that nobody reads half of it but between the two steps, when there is nothing.
+    fn write(&self, endpoint: &str) -> std::io::Result<()> {
+        let text = format!("{}\n{endpoint}\n", std::process::id());
+        self.file.set_len(0)?;
+        self.file.write_all_at(text.as_bytes(), 0)
     }
 
     /// Lets processes that are started from now on hold the lock too, for as long as they live.
@@ -77,13 +89,108 @@ impl LibraryLock {
     }
 }
 
+/// What a lock file says of who holds it. Words for people and a hint of how long to wait: nothing
+/// else follows from it.
+#[derive(Debug, Default, PartialEq)]
+struct Holder {
+    pid: Option<Pid>,
+    endpoint: Option<String>,
+}
+
+impl Holder {
+    fn read(lock: &Path) -> Self {
+        std::fs::read_to_string(lock).map_or_else(|_| Self::default(), |text| Self::parse(&text))
+    }
+
+    fn parse(text: &str) -> Self {
+        let mut lines = text.lines().map(str::trim);
+        Self {
+            pid: lines.next().and_then(|l| Pid::from_raw(l.parse().ok()?)),
+            endpoint: lines.next().filter(|l| !l.is_empty()).map(str::to_owned),
+        }
+    }
+
+    fn is_gone(&self) -> bool {
+        let found = self.pid.map(test_kill_process);
+        matches!(found, Some(Err(rustix::io::Errno::SRCH)))
+    }
+
+    /// `process 7, a daemon at ipc:///x; …`.
+    fn in_words(&self) -> String {
+        let Some(pid) = self.pid.map(Pid::as_raw_nonzero) else {
+            return "another process".to_owned();
+        };
+        if self.is_gone() {
+            return format!(
+                "what process {pid}, which has ended, had started; it ends by itself, try again"
+            );
+        }
+        match &self.endpoint {
+            Some(at) => {
+                format!("process {pid}, the daemon at {at}; `coseg stop --endpoint {at}` ends it")
+            }
+            None => format!("process {pid}"),
+        }
+    }
+}
+
 /// How long to try.
 fn patience(lock: &Path) -> Duration {
-    let holder = std::fs::read_to_string(lock).ok();
-    let pid = holder.and_then(|text| Pid::from_raw(text.trim().parse().ok()?));
-    match pid.map(test_kill_process) {
-        Some(Err(rustix::io::Errno::SRCH)) => PATIENCE_AFTER_DEATH,
-        _ => PATIENCE,
+    match Holder::read(lock).is_gone() {
+        true => PATIENCE_AFTER_DEATH,
+        false => PATIENCE,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Holder, LOCK_FILE, LibraryLock};
+
+    #[test]
+    fn whoever_finds_it_taken_hears_by_whom_and_where() {
+        let directory = tempfile::tempdir().unwrap();
+        let lock = LibraryLock::acquire(directory.path()).unwrap();
+        let held = |what: &str| {
+            let pid = std::process::id();
+            format!(
+                "{} is held by process {pid}{what}",
+                directory.path().display()
+            )
+        };
+        let refused = || {
+            LibraryLock::acquire(directory.path())
+                .unwrap_err()
+                .to_string()
+        };
+        assert_eq!(refused(), held(""));
+        lock.tell("ipc:///run/x/coseg.sock").unwrap();
+        assert_eq!(
+            refused(),
+            held(
+                ", the daemon at ipc:///run/x/coseg.sock; `coseg stop --endpoint ipc:///run/x/coseg.sock` ends it"
+            )
+        );
+        // What another has left there says nothing of the next.
+        drop(lock);
+        std::fs::write(directory.path().join(LOCK_FILE), "1\nipc:///stale\nmore\n").unwrap();
+        let _again = LibraryLock::acquire(directory.path()).unwrap();
+        assert_eq!(refused(), held(""));
+    }
+
+    #[test]
+    fn what_is_not_understood_is_another_process() {
+        for text in ["", "x", "-7\nipc:///x", "99999999999999999999"] {
+            assert_eq!(
+                Holder::parse(text).in_words(),
+                "another process",
+                "{text:?}"
+            );
+        }
+        let gone = Holder::parse("2147483647\nipc:///x\n").in_words();
+        assert!(
+            gone.starts_with("what process 2147483647, which has ended"),
+            "{gone}"
+        );
     }
 }
 

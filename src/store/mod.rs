@@ -114,6 +114,16 @@ impl Store {
         }
     }
 
+    /// Tells whoever finds the library held where its holder listens.
+    pub fn tell_endpoint(&self, endpoint: &str) -> Result<(), StoreError> {
+        match &self.lock {
+            Some(lock) => lock
+                .tell(endpoint)
+                .map_err(|e| StoreError::io(&self.dir, e)),
+            None => Ok(()),
+        }
+    }
+
     /// The object files.
     pub fn objects(&self) -> &Objects {
         &self.objects

@@ -2,9 +2,10 @@
 
     python3 tests/docs/run.py COSEG [DOCUMENT...]
 
-Every document gets a home of its own with six chairs in `meshes`, and labels of one in `labels.txt`. Commands are the
-lines of `sh` blocks, and of blocks indented by four spaces. `coseg serve` is put in the background and replaces the
-daemon that ran before. What is not typed as it stands is in the tables below, each with a reason; an entry that
+Every document gets a home of its own with six chairs in `meshes`, and labels of one in `labels.txt`; but the README's is
+empty, as its reader's is: there every file, shape and daemon comes from a command further up. Commands are the lines of
+`sh` blocks, and of blocks indented by four spaces. `coseg serve` is put in the background and replaces the daemon that ran
+before, which in the README must have been stopped. What is not typed as it stands is in the tables below, each with a reason; an entry that
 nothing needs any more is a failure too. Python and TypeScript of the documents that clients/check.sh does not run
 as programs are run here, if this Python has the client.
 """
@@ -56,6 +57,8 @@ REFUSED = {
 }
 #: Go on for ever; they must live for two seconds, and end on an interrupt.
 ENDLESS = ("coseg top", "coseg watch")
+#: Read from the top by somebody who has nothing yet.
+FROM_NOTHING = ("README.md",)
 #: Typed before a document that goes on where another one left off.
 BEFORE = {
     document: "coseg add meshes --collection chairs --parts 4 --up +y"
@@ -126,9 +129,12 @@ def free_ports(n: int) -> list[int]:
 class World:
     """A home, and the daemon in it."""
 
-    def __init__(self, coseg: Path, meshes: Path) -> None:
+    def __init__(self, coseg: Path, meshes: Path | None) -> None:
         self.home = Path(tempfile.mkdtemp(prefix="docs"))
-        shutil.copytree(meshes, self.home, dirs_exist_ok=True)
+        #: Nothing is there, and nothing is started, that the document has not said to.
+        self.is_strict = meshes is None
+        if meshes is not None:
+            shutil.copytree(meshes, self.home, dirs_exist_ok=True)
         (self.home / "bin").symlink_to(coseg.parent)
         (self.home / "run").mkdir(mode=0o700)
         for folder in ("clients", "tests", "packaging", "benches", "target"):
@@ -139,9 +145,10 @@ class World:
             "HOME": str(self.home),
             "PATH": f"{self.home}/bin:{keep['PATH']}",
             "XDG_RUNTIME_DIR": str(self.home / "run"),
-            "COSEG__SERVER__LIBRARY": str(self.home / "shapes"),
             "NO_COLOR": "1",
         }
+        if not self.is_strict:
+            self.env["COSEG__SERVER__LIBRARY"] = str(self.home / "shapes")
         self.viewer, self.port = free_ports(2)
         self.daemon: subprocess.Popen[bytes] | None = None
         self.served = "coseg serve --library shapes"
@@ -184,6 +191,8 @@ class World:
                 self.env[name] = value
             return 0, ""
         if command.startswith("coseg serve"):
+            if self.is_strict and self.daemon is not None:
+                return 1, "a daemon runs already, which the reader would hear: the document does not stop it"
             self.serve(command)
             return 0, ""
         if command.startswith("coseg stop"):
@@ -258,7 +267,8 @@ def run_document(world: World, document: str) -> list[str]:
                 used.add(why)
                 print(f"  --   {document}:{number}: {command.splitlines()[0]}")
                 continue
-            if world.daemon is None and command.startswith("coseg ") and not command.startswith("coseg check --repair"):
+            needs_none = world.is_strict or command.startswith("coseg check --repair")
+            if world.daemon is None and command.startswith("coseg ") and not needs_none:
                 world.serve(world.served)
             begin = time.monotonic()
             typed.update(re.findall(r"\bcoseg ([a-z]+)", command))
@@ -320,7 +330,7 @@ def main() -> int:
         fixture(coseg, Path(made))
         for document in documents:
             print(document, flush=True)
-            world = World(coseg, Path(made))
+            world = World(coseg, None if document in FROM_NOTHING else Path(made))
             try:
                 faults += run_document(world, document)
                 faults += run_programs(world, document)

@@ -419,6 +419,11 @@ fault(
     ("        if loopback || has_keys {", "        if loopback || has_keys || FAULT {"),
 )
 fault(
+    "R13", "r13-anybody-s-folder", "talk to whoever listens in a default folder that others may enter",
+    "src/ipc/folder.rs", "it cli::messages::a_default_folder_that_others_may_enter_is_not_trusted",
+    ("        if !found.is_symlink() && mode & forbidden != 0 {", "        if !FAULT && !found.is_symlink() && mode & forbidden != 0 {"),
+)
+fault(
     "R13", "r13-topic-of-any-length", "take subscriptions of any length",
     "src/daemon/sockets.rs", "it daemon::security::topics_and_frames_beyond_the_limits_end_their_connection_only",
     ("    publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;", "    publisher.set_maxmsgsize(if FAULT { -1 } else { MAX_SUBSCRIPTION_BYTES })?;"),

@@ -1,5 +1,8 @@
 //! The command line: what it prints, what it writes, and how it exits.
 
+mod messages;
+mod terminal;
+
 use crate::harness::{Home, SKITTLE_FACES, coseg, exists, json, skittle, stdout};
 use std::process::Output;
 use std::time::{Duration, Instant};
@@ -47,6 +50,7 @@ fn help_tells_the_commands_and_the_exit_codes() {
         "completions",
         "man",
         "stop",
+        "cancel",
         "check",
         "config",
         "synth",
@@ -364,7 +368,7 @@ fn shapes_are_compared_named_and_removed() {
         (gone.status.code(), stderr(&gone).as_str()),
         (
             Some(1),
-            "coseg: no shape named \"9\"\n  `coseg ls --collection NAME` lists the shapes\n"
+            "coseg: no shape named \"9\"\n  `coseg ls NAME` lists the shapes of a collection\n"
         )
     );
     let gone = home.coseg(&["rm", "9", "10", "--json"]);

@@ -3,10 +3,12 @@
 
 mod code;
 mod docs;
+mod figures;
 
 use crate::harness::coseg;
 use code::{Flow, code_faults};
 use docs::{commands_in, has_flag, link_faults};
+use figures::{accuracy_faults, demo_faults};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -106,6 +108,19 @@ fn links_lead_somewhere() {
         faults.extend(link_faults(root(), &file, &text));
     }
     assert_none(&faults);
+}
+
+/// What the README says of accuracy is what was measured, and of the demonstration what it does.
+#[test]
+fn figures_of_the_readme_are_those_of_the_pages() {
+    let read = |name: &str| fs::read_to_string(root().join(name)).unwrap();
+    let readme = read("README.md");
+    assert_none(&accuracy_faults(&readme, &read("docs/accuracy.md")));
+    let help = coseg().args(["demo", "--help"]).output().unwrap();
+    assert_none(&demo_faults(
+        &readme,
+        &String::from_utf8(help.stdout).unwrap(),
+    ));
 }
 
 /// What the README says to type is what the program takes.

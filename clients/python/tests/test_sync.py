@@ -106,6 +106,12 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert target.eigenvectors is not None and target.mass is not None
     pulled = target.eigenvectors[:, :k2].T @ (target.mass[:, None] * fmap.carry(phi[:, :k1]))
     assert np.abs(pulled - fmap.c_12).max() < 0.05
+    # Values of another shape, at faces, or a single one are not values at its vertices.
+    assert fmap.n1 == len(proxy.vertices)
+    for wrong in (phi[:-1], np.zeros(fmap.n1 + 1), np.zeros(len(proxy.faces)), np.zeros(())):
+        n = len(wrong) if wrong.ndim else 0
+        with pytest.raises(ValueError, match=f"values have {n} rows, .* has {fmap.n1} vertices"):
+            fmap.carry(wrong)
     assert fmap.quality.coverage > 0
     assert fmap.quality.expected_error is None
     assert fmap.confidence is not None and fmap.confidence.shape == fmap.matched.shape == (n_b,)

@@ -7,6 +7,7 @@ import { BadMesh } from "./errors.js";
 import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import type { Limits } from "./gen/coseg/v1/daemon_pb.js";
 import { AddMode, AddShapesRequestSchema, type AddShapesRequest, type ShapeInput } from "./gen/coseg/v1/job_pb.js";
+import { beyond } from "./size.js";
 import { FrameWriter, shapeInput, type Mesh } from "./wire.js";
 
 /** Shapes and bytes of one request: small enough that the first is at work while the next is read. */
@@ -62,10 +63,12 @@ export async function* batches(
     try {
       shape = await shapeInput(name, mesh, replace, one);
       if (shape.source.case === "encoded" && one.nBytes > Number(limits.maxShapeBytes)) {
-        throw new BadMesh(`${name}: the file has ${one.nBytes} bytes, the limit is ${limits.maxShapeBytes}`);
+        const key = "limits.max_shape, within limits.memory";
+        throw new BadMesh(beyond(`${name}: the file has`, one.nBytes, Number(limits.maxShapeBytes), key));
       }
       if (one.nBytes > (maxMessage * 15) / 16) {
-        throw new BadMesh(`${name}: the arrays have ${one.nBytes} bytes, a message at most ${maxMessage}`);
+        const key = "limits.max_message, of which arrays may have 15 in 16";
+        throw new BadMesh(beyond(`${name}: the arrays have`, one.nBytes, maxMessage, key));
       }
     } catch (e) {
       batch.results.push({ name, error: e instanceof Error ? e : new Error(String(e)) });

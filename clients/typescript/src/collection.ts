@@ -4,7 +4,7 @@ import { randomUUID } from "node:crypto";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fromBinary } from "@bufbuild/protobuf";
 import { batches, type Batch, type Item } from "./batch.js";
-import { BadReply, EventLogRewound, NoAnswer, Refused } from "./errors.js";
+import { BadReply, CosegError, EventLogRewound, NoAnswer, Refused } from "./errors.js";
 import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import { EventSchema } from "./gen/coseg/v1/event_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
@@ -166,10 +166,11 @@ export class Collection {
   }
 
   /** All shapes in the order of their arrival, or those that carry a label. */
-  async *shapes(options: { label?: number } = {}): AsyncGenerator<Shape> {
+  async *shapes(options: { label?: number | string } = {}): AsyncGenerator<Shape> {
+    const wish = options.label === undefined ? {} : { label: await this.#label(options.label) };
     let pageToken = "";
     do {
-      const [reply] = await this.library.call("listShapes", { collection: this.name, pageToken, ...options });
+      const [reply] = await this.library.call("listShapes", { collection: this.name, pageToken, ...wish });
       for (const shape of reply.shapes) yield plain(shape);
       pageToken = reply.nextPageToken;
     } while (pageToken !== "");
@@ -290,6 +291,9 @@ export class Collection {
     let shape = [values.length];
     if (values instanceof Float32Array) {
       const n = (await this.shape(from)).nPolygons;
+      if (values.length === 0 || values.length % n !== 0) {
+        throw new CosegError(`${values.length} values are not as many for each of the ${n} faces of ${from}`);
+      }
       shape = [n, values.length / n];
     }
     const array = writer.array(values, ...shape);
@@ -319,8 +323,8 @@ export class Collection {
     name: string,
     correction:
       | Int32Array
-      | { readonly faces: Uint32Array; readonly label: number }
-      | { readonly part: number; readonly label: number },
+      | { readonly faces: Uint32Array; readonly label: number | string }
+      | { readonly part: number; readonly label: number | string },
   ): Promise<Corrected> {
     const writer = new FrameWriter();
     const what =
@@ -329,30 +333,46 @@ export class Collection {
         : "faces" in correction
           ? {
               case: "faces" as const,
-              value: { faces: writer.array(correction.faces, correction.faces.length), label: correction.label },
+              value: { faces: writer.array(correction.faces, correction.faces.length), label: await this.#label(correction.label) },
             }
-          : { case: "part" as const, value: correction };
+          : { case: "part" as const, value: { part: correction.part, label: await this.#label(correction.label) } };
     const request = { collection: this.name, shape: name, correction: what };
     const [reply] = await this.library.call("correctLabels", request, { frames: writer.frames });
     return { ...plain(reply), jobId: reply.jobId };
   }
 
-  /** Gives a label a name. */
-  async nameLabel(label: number, name: string): Promise<Label> {
-    const [reply] = await this.library.call("nameLabel", { collection: this.name, label, name });
+  /** Gives a label, named by its id or the name it has, a name. */
+  async nameLabel(label: number | string, name: string): Promise<Label> {
+    const request = { collection: this.name, label: await this.#label(label), name };
+    const [reply] = await this.library.call("nameLabel", request);
     return present(reply.label);
   }
 
-  /** Makes one label of two: faces of `label` carry `into` from now on. */
-  async merge(label: number, into: number): Promise<ChangedLabel> {
-    const [reply] = await this.library.call("mergeLabels", { collection: this.name, label, into });
+  /** Makes one label of two: faces of `label` carry `into` from now on. Both by id or name. */
+  async merge(label: number | string, into: number | string): Promise<ChangedLabel> {
+    const request = { collection: this.name, label: await this.#label(label), into: await this.#label(into) };
+    const [reply] = await this.library.call("mergeLabels", request);
     return { ...present(reply.label), nChanged: Number(reply.nShapes) };
   }
 
-  /** Makes two labels of one, and returns the new one. */
-  async split(label: number): Promise<ChangedLabel> {
-    const [reply] = await this.library.call("splitLabel", { collection: this.name, label });
+  /** Makes two labels of one, by id or name, and returns the new one. */
+  async split(label: number | string): Promise<ChangedLabel> {
+    const request = { collection: this.name, label: await this.#label(label) };
+    const [reply] = await this.library.call("splitLabel", request);
     return { ...present(reply.label), nChanged: Number(reply.nShapes) };
+  }
+
+  /** The id of a label; text that is all digits is one, other text the name of a label in use. */
+  async #label(label: number | string): Promise<number> {
+    if (typeof label === "number") return label;
+    if (/^[0-9]+$/.test(label)) return Number(label);
+    const inUse = (await this.info()).labels.filter((l) => l.mergedInto === undefined);
+    const found = inUse.filter((l) => label !== "" && l.name === label).map((l) => l.id);
+    if (found.length === 0) throw new CosegError(`no label of ${this.name} is named ${JSON.stringify(label)}`);
+    if (found.length > 1) {
+      throw new CosegError(`${found.length} labels are named ${JSON.stringify(label)}, say which by its id: ${found.join(", ")}`);
+    }
+    return found[0]!;
   }
 
   /** Takes back the newest correction, name, merge or split. */

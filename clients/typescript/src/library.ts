@@ -5,10 +5,12 @@ import { setTimeout as sleep } from "node:timers/promises";
 import { create, toBinary, type MessageInitShape } from "@bufbuild/protobuf";
 import { Collection } from "./collection.js";
 import { BadReply, CosegError, refused } from "./errors.js";
+import { defaultFolder } from "./folder.js";
 import type { HelloReply } from "./gen/coseg/v1/daemon_pb.js";
 import type { Job as WireJob } from "./gen/coseg/v1/job_pb.js";
 import { RequestSchema, type Reply, type Request } from "./gen/coseg/v1/message_pb.js";
 import { job, spec } from "./replies.js";
+import { beyond } from "./size.js";
 import { curveFromEnv, Transport } from "./transport.js";
 import type { CollectionInfo, FunctionalMap, Hello, Job, MapOptions, Options, RetriedJob, Settings, Stats } from "./types.js";
 import { plain, Raw } from "./wire.js";
@@ -25,13 +27,9 @@ type Body = Exclude<Request["body"]["case"], undefined>;
 type Init<C extends Body> = Extract<Bodies, { case: C }>["value"];
 type Result<C extends Body> = Extract<Reply["result"], { case: C }>["value"];
 
-/** Where a daemon of this user listens when nobody says otherwise. */
+/** Where a daemon of this user listens when nobody says otherwise. Throws if somebody else could listen there. */
 export function defaultEndpoint(): string {
-  const { COSEG_ENDPOINT, RUNTIME_DIRECTORY, XDG_RUNTIME_DIR } = process.env;
-  if (COSEG_ENDPOINT) return COSEG_ENDPOINT;
-  if (RUNTIME_DIRECTORY) return `ipc://${RUNTIME_DIRECTORY}/coseg.sock`;
-  if (XDG_RUNTIME_DIR) return `ipc://${XDG_RUNTIME_DIR}/coseg/coseg.sock`;
-  return `ipc:///tmp/coseg-${process.getuid?.() ?? 0}/coseg.sock`;
+  return process.env.COSEG_ENDPOINT || `ipc://${defaultFolder()}/coseg.sock`;
 }
 
 /** A connection to a daemon, and the library that it keeps. That somebody listens shows with the first request. */
@@ -77,7 +75,7 @@ export class Library {
     const nBytes = frames.reduce((n, frame) => n + frame.length, 0);
     const limit = this.#hello?.limits?.maxMessageBytes;
     if (limit !== undefined && BigInt(nBytes) > limit) {
-      throw new CosegError(`the message has ${nBytes} bytes, the daemon's limit is ${limit}`);
+      throw new CosegError(beyond("the message has", nBytes, Number(limit), "limits.max_message"));
     }
     for (;;) {
       const [{ result }, raw] = await this.transport.exchange(request.requestId, frames);

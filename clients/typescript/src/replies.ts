@@ -1,14 +1,21 @@
 /** What the daemon tells becomes what the client returns, and settings what it is asked with. */
 
 import { create } from "@bufbuild/protobuf";
-import { BadReply, refused } from "./errors.js";
+import { BadReply, CosegError, refused } from "./errors.js";
 import { MapOrientation, type GetFunctionalMapReply, type MapQuality as WireMapQuality } from "./gen/coseg/v1/analysis_pb.js";
 import { CollectionSpecSchema, Operator, Up, type CollectionSpec, type LabelInfo } from "./gen/coseg/v1/collection_pb.js";
 import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/coseg/v1/job_pb.js";
 import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Settings } from "./types.js";
 import { plain, type Raw } from "./wire.js";
 
+/** Most kinds of parts that a collection can be told to have. */
+const MAX_PARTS = 64;
+
 export function spec(settings: Settings): CollectionSpec {
+  const { parts } = settings;
+  if (parts !== undefined && !(Number.isInteger(parts) && parts >= 0 && parts <= MAX_PARTS)) {
+    throw new CosegError(`parts is ${parts}, but must be 1 to ${MAX_PARTS}, or 0: estimated`);
+  }
   const up = settings.up?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
   const operator = settings.operator?.toUpperCase().replace("-", "_") as keyof typeof Operator | undefined;
   return create(CollectionSpecSchema, {
@@ -47,6 +54,7 @@ export function functionalMap(from: string, to: string, reply: GetFunctionalMapR
     p2p21: raw.array(Uint32Array, p2p21).data,
     quality: mapQuality(quality),
     matched: raw.array(Uint32Array, matched).data,
+    n1: reply.n1,
   });
   return {
     ...one(reply.c12, reply.p2p21, reply.quality, reply.matched),

@@ -120,6 +120,8 @@ export interface FunctionalMap {
   readonly alternative?: FunctionalMap;
   /** What that costs over what this one does: near 1, the shapes themselves hardly say which is meant. */
   readonly alternativeCost?: number;
+  /** Vertices of shape 1's working mesh; 0 from a daemon that does not say. */
+  readonly n1: number;
 }
 
 /** How a map between points is made. */

@@ -3,7 +3,7 @@
 import { execFileSync } from "node:child_process";
 import { copyFileSync, mkdirSync, mkdtempSync, readFileSync, rmSync, symlinkSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
-import { join } from "node:path";
+import { basename, join } from "node:path";
 import { chairs, Daemon } from "./daemon.js";
 
 const root = process.env.COSEG_ROOT;
@@ -19,7 +19,9 @@ for (const document of ["README.md", "clients/typescript/README.md", "docs/clien
   const daemon = await Daemon.started();
   try {
     mkdirSync(join(folder, "meshes"));
-    meshes.forEach((path, i) => copyFileSync(path, join(folder, "meshes", `${101 + i}.off`)));
+    // The README's reader has what `coseg synth` made; the others write of shapes called 101 and so on.
+    const name = (path: string, i: number) => (document === "README.md" ? basename(path) : `${101 + i}.off`);
+    meshes.forEach((path, i) => copyFileSync(path, join(folder, "meshes", name(path, i))));
     // `coseg` is this package, and types are checked too.
     mkdirSync(join(folder, "node_modules"));
     symlinkSync(here, join(folder, "node_modules", "coseg"));

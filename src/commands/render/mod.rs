@@ -25,7 +25,7 @@ const LINE: usize = GLYPH + 6;
 const ASPECT: f64 = 1.5;
 
 pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
-    let collection = session.settled_collection(args.name.as_ref(), &args.within, args.no_wait)?;
+    let collection = session.settled_collection(&args.of, args.no_wait)?;
     let about = session.describe(&collection)?;
     let mut shapes = session.shapes(&collection, None)?;
     if let Some(max) = args.max {

@@ -50,7 +50,9 @@ pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes])
                 let maps = library
                     .point_maps(&r.collection, &r.from, &r.to, &asked)
                     .map_err(refuse)?;
-                Reply::GetFunctionalMap(convert::point_maps(&maps, &mut frames))
+                let n1 = library.n_proxy_vertices(&r.collection, &r.from);
+                let reply = convert::point_maps(&maps, &mut frames);
+                Reply::GetFunctionalMap(convert::from_vertices(reply, n1.map_err(refuse)?))
             }
             None => {
                 let map = library.map(&r.collection, &r.from, &r.to).map_err(refuse)?;
@@ -59,7 +61,8 @@ pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes])
                     let standing = library.standing(&r.collection, &r.from, &r.to, &map);
                     reply.agreement = standing.map_err(refuse)?.map(convert::agreement);
                 }
-                Reply::GetFunctionalMap(reply)
+                let n1 = library.n_proxy_vertices(&r.collection, &r.from);
+                Reply::GetFunctionalMap(convert::from_vertices(reply, n1.map_err(refuse)?))
             }
         },
         Body::TransferFunction(r) => {

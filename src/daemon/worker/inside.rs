@@ -6,6 +6,7 @@ use super::{
 use crate::daemon::panic_text;
 use crate::daemon::requests::Answer;
 use crate::ipc::convert;
+use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply};
 use crate::library::isolate::{self, DescribeJob};
 use crate::library::{Failure, ItemState, LibraryError};
@@ -186,7 +187,7 @@ fn answer(
         let (result, frames) = answers::answer(library, &request, &frames)?;
         let found = frames.iter().map(|f| f.len() as u64).sum::<u64>();
         if found > max_bytes {
-            let text = format!("the answer has {found} bytes, the limit is {max_bytes}");
+            let text = size::beyond("the answer", found, max_bytes, "limits.max_message");
             let code = ErrorCode::InvalidArgument;
             return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
         }

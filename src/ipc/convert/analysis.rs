@@ -174,6 +174,12 @@ pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunct
     }
 }
 
+/// The same map, of a shape whose proxy has so many vertices.
+pub fn from_vertices(map: wire::GetFunctionalMapReply, n1: usize) -> wire::GetFunctionalMapReply {
+    let n1 = u32::try_from(n1).unwrap_or(u32::MAX);
+    wire::GetFunctionalMapReply { n1, ..map }
+}
+
 /// How a map agrees with the others of its collection.
 pub fn agreement(standing: Standing) -> wire::MapAgreement {
     wire::MapAgreement {

@@ -152,11 +152,13 @@ mod tests {
         let e = library_error(&LibraryError::NotFound {
             what: "shape",
             name: "x".to_owned(),
+            nearest: Some("xy".to_owned()),
         });
         assert_eq!(
             (e.code(), e.reason()),
             (ErrorCode::NotFound, ErrorReason::NoShape)
         );
+        assert_eq!(e.message, "no shape named \"x\"; did you mean \"xy\"?");
     }
 
     #[test]

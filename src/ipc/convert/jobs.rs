@@ -2,6 +2,7 @@
 
 use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
+use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, error::Subject, shape_input};
 use crate::library::{Carrying, ItemState, Job, JobItem, Outcome, Placed};
 use crate::mesh::Format;
@@ -47,7 +48,9 @@ impl Ingest {
             return Ok(());
         }
         let field = format!("shapes[{i}]");
-        let message = format!("{field} ({name:?}) has {found} bytes, the limit is {limit}");
+        let what = format!("{field} ({name:?})");
+        let key = "limits.max_shape, within limits.memory";
+        let message = size::beyond(&what, found, limit, key);
         Err(field_error(ErrorReason::MeshTooLarge, &field, message))
     }
 }

@@ -10,8 +10,8 @@ mod jobs;
 mod shapes;
 
 pub use analysis::{
-    agreement, descriptors, functional_map, hks, nearest, part_correspondence, point_maps,
-    point_request, polygon_values, spectrum, transferred,
+    agreement, descriptors, from_vertices, functional_map, hks, nearest, part_correspondence,
+    point_maps, point_request, polygon_values, spectrum, transferred,
 };
 pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
 pub use collections::{collection, collection_differs, collection_spec, label_info};

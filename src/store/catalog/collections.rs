@@ -28,6 +28,14 @@ impl Reader<'_> {
         })
     }
 
+    /// Names of collections, at most `limit`.
+    pub fn collection_names(&self, limit: u32) -> Result<Vec<String>> {
+        self.names(
+            "SELECT name FROM collections ORDER BY name LIMIT ?1",
+            [limit],
+        )
+    }
+
     /// All collections by name.
     pub fn collections(&self) -> Result<Vec<CollectionRow>> {
         self.all(&COLLECTIONS, "ORDER BY name", [], |fields| {

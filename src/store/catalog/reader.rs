@@ -155,6 +155,13 @@ impl<'c> Reader<'c> {
             .query_row(params, |row| row.get(0))?)
     }
 
+    /// Texts that are for people to read, and that no sum is checked of.
+    pub(super) fn names(&self, sql: &str, params: impl Params) -> Result<Vec<String>> {
+        let mut statement = self.connection.prepare_cached(sql)?;
+        let rows = statement.query_map(params, |row| row.get(0))?;
+        Ok(rows.collect::<rusqlite::Result<_>>()?)
+    }
+
     pub(super) fn optional<T: FromSql>(&self, sql: &str, params: impl Params) -> Result<Option<T>> {
         Ok(self
             .connection

@@ -114,6 +114,13 @@ impl Reader<'_> {
         self.all(&SHAPES, tail, [collection], |fields| fields.get("id"))
     }
 
+    /// Names of the first shapes of a collection, at most `limit`, without a look at the rest of
+    /// their rows.
+    pub fn shape_names(&self, collection: CollectionId, limit: u32) -> Result<Vec<String>> {
+        let sql = "SELECT name FROM shapes WHERE collection_id = ?1 ORDER BY ordinal LIMIT ?2";
+        self.names(sql, params![collection, limit])
+    }
+
     /// Shapes of a collection.
     pub fn n_shapes(&self, collection: CollectionId) -> Result<u64> {
         self.number(

@@ -468,7 +468,7 @@ fn a_full_queue_is_said_with_a_delay() {
             assert_eq!(e.code(), ErrorCode::ResourceExhausted);
             assert_eq!(e.reason(), ErrorReason::QueueFull);
             assert!(e.retry_after_ms > 0);
-            let end = "shapes are queued and 2 more asked for, the limit is 2";
+            let end = "shapes are queued and 2 shapes more asked for, the limit is 2 shapes (limits.max_queued_shapes)";
             assert!(e.message.ends_with(end), "{}", e.message);
         }
         other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
@@ -476,7 +476,7 @@ fn a_full_queue_is_said_with_a_delay() {
     match send(&["e", "f", "g"]) {
         Err(ClientError::Refused(e)) => {
             assert_eq!(e.code(), ErrorCode::InvalidArgument);
-            let text = "the request has 3 shapes, the whole queue holds 2";
+            let text = "the request has 3 shapes, the whole queue holds 2 shapes (limits.max_queued_shapes)";
             assert_eq!(e.message, text);
         }
         other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),

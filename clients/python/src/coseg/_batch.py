@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from coseg import types as t
+from coseg._size import beyond
 from coseg._wire import FrameWriter, Mesh, shape_input
 from coseg.errors import BadMesh
 from coseg.v1 import collection_pb2, job_pb2
@@ -69,10 +70,12 @@ def batches(
             shape = shape_input(name, mesh, replace, one)
             if one.n_bytes > limits.max_shape_bytes and shape.HasField("encoded"):
                 limit = limits.max_shape_bytes
-                raise BadMesh(f"{name}: the file has {one.n_bytes} bytes, the limit is {limit}")
+                key = "limits.max_shape, within limits.memory"
+                raise BadMesh(beyond(f"{name}: the file has", one.n_bytes, limit, key))
             if one.n_bytes > limits.max_message_bytes * 15 // 16:
                 limit = limits.max_message_bytes
-                raise BadMesh(f"{name}: the arrays have {one.n_bytes} bytes, a message at most {limit}")
+                key = "limits.max_message, of which arrays may have 15 in 16"
+                raise BadMesh(beyond(f"{name}: the arrays have", one.n_bytes, limit, key))
         except (BadMesh, OSError) as e:
             batch.results.append(t.Added(name, "failed", error=e))
             continue

@@ -17,6 +17,7 @@ from coseg._sync_transport import Subscription, Transport
 from coseg._batch import Batch, Item, batches
 from coseg._link import Frame
 from coseg._options import Curve, default_endpoint, new_client_id, reachable
+from coseg._size import beyond
 from coseg._wire import FrameWriter, Mesh, Raw
 from coseg.errors import BadReply, CosegError, EventLogRewound, NoAnswer, Refused
 from coseg.v1 import collection_pb2, event_pb2, message_pb2
@@ -119,7 +120,7 @@ class Library:
         if self._hello is not None:
             n_bytes, limit = sum(map(len, message)), self._hello.limits.max_message_bytes
             if n_bytes > limit:
-                raise CosegError(f"the message has {n_bytes} bytes, the daemon's limit is {limit}")
+                raise CosegError(beyond("the message has", n_bytes, limit, "limits.max_message"))
 
     # -- the daemon -----------------------------------------------------------------------------
 
@@ -377,11 +378,11 @@ class Collection:
 
     # -- shapes ---------------------------------------------------------------------------------
 
-    def shapes(self, *, label: int | None = None) -> Iterator[t.Shape]:
-        """All shapes in the order of their arrival, or those that carry a label."""
+    def shapes(self, *, label: int | str | None = None) -> Iterator[t.Shape]:
+        """All shapes in the order of their arrival, or those that carry a label, by its id or name."""
         token = ""
+        fields: dict[str, Any] = {} if label is None else {"label": self._label(label)}
         while True:
-            fields: dict[str, Any] = {} if label is None else {"label": label}
             reply, _ = self._call("list_shapes", page_token=token, **fields)
             for shape in reply.shapes:
                 yield wire.shape(shape)
@@ -503,6 +504,10 @@ class Collection:
     ) -> t.Transferred:
         """What :meth:`transfer` gives, with the quality of the map."""
         array, writer = np.asarray(values), FrameWriter()
+        if array.ndim == 0 or array.size == 0 or array.dtype.kind not in "biuf":
+            raise ValueError(
+                f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each face"
+            )
         if array.dtype.kind in "iu":
             ref = writer.array(_integers(array, np.int32, "values"))
         else:
@@ -532,39 +537,54 @@ class Collection:
         *,
         faces: ArrayLike | None = None,
         part: int | None = None,
-        label: int | None = None,
+        label: int | str | None = None,
     ) -> t.Corrected:
         """Labels faces of a shape by hand: ``labels`` for all of them (−1 leaves one alone), or one
-        ``label`` for some ``faces`` or one ``part``. They never change again by themselves; other
-        shapes follow in the background: :meth:`wait_idle`."""
+        ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves;
+        other shapes follow in the background: :meth:`wait_idle`."""
         writer = FrameWriter()
         fields: dict[str, Any]
         if labels is not None and faces is None and part is None and label is None:
             fields = {"labels": writer.array(_integers(labels, np.int32, "labels"))}
         elif label is not None and faces is not None and labels is None and part is None:
             ref = writer.array(_integers(faces, np.uint32, "faces"))
-            fields = {"faces": {"faces": ref, "label": label}}
+            fields = {"faces": {"faces": ref, "label": self._label(label)}}
         elif label is not None and part is not None and labels is None and faces is None:
-            fields = {"part": {"part": part, "label": label}}
+            fields = {"part": {"part": part, "label": self._label(label)}}
         else:
             raise ValueError("give labels, or faces and label, or part and label")
         reply, _ = self._call("correct_labels", writer.frames, shape=name, **fields)
         return wire.flat(t.Corrected, reply)
 
-    def name_label(self, label: int, name: str) -> t.Label:
-        """Gives a label a name."""
-        reply, _ = self._call("name_label", label=label, name=name)
+    def name_label(self, label: int | str, name: str) -> t.Label:
+        """Gives a label, named by its id or the name it has, a name."""
+        reply, _ = self._call("name_label", label=self._label(label), name=name)
         return wire.label(reply.label)
 
-    def merge(self, label: int, into: int) -> t.ChangedLabel:
-        """Makes one label of two: faces of ``label`` carry ``into`` from now on."""
+    def merge(self, label: int | str, into: int | str) -> t.ChangedLabel:
+        """Makes one label of two: faces of ``label`` carry ``into`` from now on. Both by id or name."""
+        label, into = self._label(label), self._label(into)
         reply, _ = self._call("merge_labels", label=label, into=into)
         return wire.changed_label(reply)
 
-    def split(self, label: int) -> t.ChangedLabel:
-        """Makes two labels of one, and returns the new one."""
-        reply, _ = self._call("split_label", label=label)
+    def split(self, label: int | str) -> t.ChangedLabel:
+        """Makes two labels of one, by id or name, and returns the new one."""
+        reply, _ = self._call("split_label", label=self._label(label))
         return wire.changed_label(reply)
+
+    def _label(self, label: int | str) -> int:
+        """The id of a label; text that is all digits is one, other text the name of a label in use."""
+        if not isinstance(label, str):
+            return int(label)
+        if label.isascii() and label.isdigit():
+            return int(label)
+        in_use = [known for known in (self.info()).labels if known.merged_into is None]
+        found = [known.id for known in in_use if label and known.name == label]
+        if len(found) != 1:
+            ids = ", ".join(map(str, found))
+            text = f"{len(found)} labels are named {label!r}, say which by its id: {ids}"
+            raise ValueError(text if found else f"no label of {self.name!r} is named {label!r}")
+        return found[0]
 
     def undo(self) -> t.Undone:
         """Takes back the newest correction, name, merge or split."""

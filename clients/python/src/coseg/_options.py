@@ -11,6 +11,7 @@ from typing import Any
 
 import zmq
 
+from coseg._folder import default_folder
 from coseg.errors import CosegError
 
 
@@ -61,13 +62,11 @@ def _key(path: str | os.PathLike[str], kind: str) -> str:
 
 
 def default_endpoint() -> str:
-    """``$COSEG_ENDPOINT``, else where a daemon of this user listens when nobody says otherwise."""
-    if endpoint := os.environ.get("COSEG_ENDPOINT"):
-        return endpoint
-    for variable, below in (("RUNTIME_DIRECTORY", ""), ("XDG_RUNTIME_DIR", "/coseg")):
-        if directory := os.environ.get(variable):
-            return f"ipc://{directory}{below}/coseg.sock"
-    return f"ipc:///tmp/coseg-{os.getuid()}/coseg.sock"
+    """``$COSEG_ENDPOINT``, else where a daemon of this user listens when nobody says otherwise.
+
+    Raises :class:`CosegError` if somebody else could listen there in its place.
+    """
+    return os.environ.get("COSEG_ENDPOINT") or f"ipc://{default_folder()}/coseg.sock"
 
 
 def reachable(announced: str, endpoint: str) -> str:

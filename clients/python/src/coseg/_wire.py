@@ -37,6 +37,10 @@ _DTYPES: dict[int, np.dtype[Any]] = {
 _WIRE_DTYPES: dict[np.dtype[Any], Any] = {dtype: wire for wire, dtype in _DTYPES.items()}
 
 
+#: Most kinds of parts that a collection can be told to have.
+MAX_PARTS = 64
+
+
 @runtime_checkable
 class HasFaces(Protocol):
     """A mesh object, such as ``trimesh.Trimesh``."""
@@ -245,6 +249,8 @@ def collection_spec(
     """What a collection is created with."""
     spec = collection_pb2.CollectionSpec(name=name, working_faces=working_faces)
     if parts is not None:
+        if not 0 <= parts <= MAX_PARTS:
+            raise ValueError(f"parts is {parts}, but must be 1 to {MAX_PARTS}, or 0: estimated")
         spec.n_parts = parts
     if up is not None:
         key = "UP_" + up.upper().replace("+", "PLUS_").replace("-", "MINUS_")
@@ -351,6 +357,7 @@ def functional_map(
             raw.array(reply.alternative_p2p_21),
             map_quality(reply.alternative_quality),
             raw.array(reply.alternative_matched) != 0,
+            n1=reply.n1,
         )
     return t.FunctionalMap(
         source,
@@ -363,6 +370,7 @@ def functional_map(
         agreement=flat(t.MapAgreement, reply.agreement) if reply.HasField("agreement") else None,
         alternative=alternative,
         alternative_cost=reply.alternative_cost if reply.HasField("alternative_cost") else None,
+        n1=reply.n1,
     )
 
 

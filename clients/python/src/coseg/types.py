@@ -339,10 +339,25 @@ class FunctionalMap:
     alternative: FunctionalMap | None = None
     #: What that costs over what this one does: near 1, the shapes themselves hardly say which is meant.
     alternative_cost: float | None = None
+    #: Vertices of shape 1's working mesh: so many values :meth:`carry` takes. 0: a daemon that does not say.
+    n1: int = 0
 
     def carry(self, values: NDArray[Element]) -> NDArray[Element]:
-        """Carries values at vertices of shape 1, (n1, …), to those of shape 2, (n2, …)."""
-        carried: NDArray[Element] = values[self.p2p_21]
+        """Carries values at vertices of shape 1's working mesh, (n1, …), to those of shape 2's, (n2, …).
+
+        Raises :class:`ValueError` if there are not n1 of them: values at faces, at vertices of the
+        file, or of the other shape would be carried without a word, and mean nothing.
+        """
+        array = np.asarray(values)
+        n = len(array) if array.ndim else 0
+        # Of a daemon that does not say how many there are, only that there are at least those that are named.
+        least = self.n1 or int(self.p2p_21.max()) + 1
+        if n < least or (self.n1 and n != self.n1):
+            raise ValueError(
+                f"values have {n} rows, but the working mesh of {self.source!r} has {least} vertices; "
+                "`hks`, `spectrum(…).eigenvectors` and `descriptors(…).vertices` have a row for each"
+            )
+        carried: NDArray[Element] = array[self.p2p_21]
         return carried
 
 

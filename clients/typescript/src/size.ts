@@ -1,0 +1,21 @@
+/** Numbers of bytes as messages tell them. */
+
+const UNITS = [
+  ["TiB", 2 ** 40],
+  ["GiB", 2 ** 30],
+  ["MiB", 2 ** 20],
+  ["KiB", 2 ** 10],
+] as const;
+
+/** `64 MiB` where it is just that, `76.3 MiB (80000000 bytes)` where it is rounded. */
+export function inWords(n: number): string {
+  const found = UNITS.find(([, unit]) => n >= unit);
+  if (found === undefined) return n === 1 ? "1 byte" : `${n} bytes`;
+  const [name, unit] = found;
+  return n % unit === 0 ? `${n / unit} ${name}` : `${(n / unit).toFixed(1)} ${name} (${n} bytes)`;
+}
+
+/** That something is larger than a limit, and which setting of the daemon raises that. */
+export function beyond(what: string, found: number, limit: number, key: string): string {
+  return `${what} ${inWords(found)}, the limit is ${inWords(limit)} (${key} of the daemon's configuration)`;
+}
