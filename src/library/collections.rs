@@ -204,6 +204,14 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
             up: Up::along(up.vote().trusted()),
             agreement: up.agreement,
         }),
+        up_disagrees: state.up_disagrees.and_then(|other| {
+            let axis = other.vote().trusted()?;
+            Some(UpEstimate {
+                up: Up::along(Some(axis)),
+                agreement: other.agreement,
+            })
+        }),
+        n_undoable: reader.n_corrections(row.id)?,
         sequence: row.sequence,
         n_shapes: reader.n_shapes(row.id)?,
         n_stale: reader.n_stale(row.id)?,

@@ -51,6 +51,7 @@ mod submit;
 mod suggest;
 mod teach;
 mod types;
+mod upright;
 
 pub use agreement::Disagreement;
 pub use apart::{state_from_json, state_to_json};
@@ -69,6 +70,7 @@ pub use types::{
     Job, JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
     PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up, UpEstimate,
 };
+pub use upright::UpSet;
 
 use crate::pipeline::Description;
 use crate::store::check::Finding;

@@ -8,13 +8,17 @@ import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/cos
 import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Settings } from "./types.js";
 import { plain, type Raw } from "./wire.js";
 
+export function up(name: Settings["up"]): Up {
+  const key = name?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
+  return key === undefined ? Up.UNSPECIFIED : Up[key];
+}
+
 export function spec(settings: Settings): CollectionSpec {
-  const up = settings.up?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
   const operator = settings.operator?.toUpperCase().replace("-", "_") as keyof typeof Operator | undefined;
   return create(CollectionSpecSchema, {
     ...(settings.parts !== undefined && { nParts: settings.parts }),
     workingFaces: settings.workingFaces ?? 0,
-    up: up === undefined ? Up.UNSPECIFIED : Up[up],
+    up: up(settings.up),
     operator: operator === undefined ? Operator.UNSPECIFIED : Operator[operator],
   });
 }

@@ -125,10 +125,16 @@ fn unknown(path: &str) -> wire::Error {
 async fn library(server: &Server) -> Answer {
     let request = wire::ListCollectionsRequest {};
     let (reply, _) = ask!(server, ListCollections(request))?;
-    let collections: Vec<Value> = reply.collections.iter().map(json::collection).collect();
-    let (queued, at_work) = {
+    let (collections, queued, at_work): (Vec<Value>, _, _) = {
         let progress = server.daemon.work.progress();
-        (progress.n_live(None), progress.n_at_stages())
+        let collections = reply.collections.iter().map(|c| {
+            let mut about = json::collection(c);
+            let name = c.spec.as_ref().map(|s| s.name.as_str());
+            about["n_queued"] = progress.n_live(name).into();
+            about
+        });
+        let collections = collections.collect();
+        (collections, progress.n_live(None), progress.n_at_stages())
     };
     Ok(Found::Json(json!({
         "version": env!("CARGO_PKG_VERSION"),

@@ -12,7 +12,9 @@ pub use analysis::{
     agreement, descriptors, functional_map, hks, nearest, part_correspondence, point_maps,
     point_request, polygon_values, spectrum, transferred,
 };
-pub use collections::{collection, collection_differs, collection_spec, label_info};
+pub use collections::{
+    collection, collection_differs, collection_spec, label_info, new_up, updated,
+};
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{
     error, failure, field_error, frame_error, library_error, library_failure, with_subject,
