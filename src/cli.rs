@@ -140,9 +140,9 @@ pub(crate) enum Command {
     Merge(Merge),
     /// Make two labels of one
     Split(Split),
-    /// Take back the newest correction, name, merge or split; repeat to go further back
+    /// Take back the newest correction, name, merge, split or change of the up axis; repeat to go further back
     Undo(Undo),
-    /// Create or delete collections
+    /// Create, change or delete collections
     #[command(subcommand)]
     Collections(Collections),
     /// Show counters of the daemon
@@ -531,6 +531,17 @@ pub(crate) enum Collections {
         name: String,
         #[command(flatten)]
         settings: Settings,
+    },
+    /// Change which way is up; labels are found again along the new axis, and faces labelled by hand keep theirs
+    Set {
+        /// The collection
+        name: String,
+        /// The axis that points up in every file: +x -x +y -y +z -z unknown auto
+        #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+        up: wire::Up,
+        /// Return when the axis is set, not when all shapes are labelled anew
+        #[arg(long)]
+        no_wait: bool,
     },
     /// Delete a collection with its shapes and labels
     Delete {

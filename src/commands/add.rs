@@ -3,6 +3,7 @@
 //! Files are sent in batches, a few jobs ahead of the one being waited for, so that the daemon always
 //! has something to describe. The same command again resumes: what is there is `unchanged`.
 
+use super::collections::warn_of_up;
 use super::mesh_files::{self, Found, MeshFile, printable};
 use super::session::{Session, ambiguous, bar};
 use super::{CommandError, Outcome, interrupt, json};
@@ -106,7 +107,8 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     while !jobs.is_empty() {
         finish_job(&mut jobs, &mut session, &mut report)?;
     }
-    report.finish(&collection, begin, &session)
+    let described = session.describe(&collection).ok();
+    report.finish(&collection, begin, described.as_ref(), &session)
 }
 
 /// Shapes of the next request.
@@ -279,7 +281,13 @@ impl Report {
         *self.counts.entry(outcome.to_owned()).or_default() += 1;
     }
 
-    fn finish(self, collection: &str, begin: Instant, session: &Session) -> Outcome {
+    fn finish(
+        self,
+        collection: &str,
+        begin: Instant,
+        described: Option<&wire::Collection>,
+        session: &Session,
+    ) -> Outcome {
         self.bar.finish_and_clear();
         let seconds = begin.elapsed().as_secs_f64();
         let count = |outcome: &str| self.counts.get(outcome).copied().unwrap_or(0);
@@ -289,6 +297,8 @@ impl Report {
             for outcome in outcomes {
                 value[format!("n_{outcome}")] = count(outcome).into();
             }
+            let other = described.and_then(|c| c.up_disagrees.as_ref());
+            value["up_disagrees"] = other.map(json::up_estimate).into();
             value["shapes"] = self.shapes.into();
             session.print_json(&value)?;
         } else {
@@ -298,6 +308,9 @@ impl Report {
                 .map(|o| format!("{} {o}", count(o)))
                 .collect();
             eprintln!("{collection}: {} in {seconds:.1} s", counted.join(", "));
+        }
+        if let Some(described) = described {
+            warn_of_up(described);
         }
         Ok(self.n_failed == 0)
     }

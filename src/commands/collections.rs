@@ -1,4 +1,4 @@
-//! `coseg collections`: collections come and go.
+//! `coseg collections`: collections come, change and go.
 
 use super::confirm::confirmed;
 use super::session::Session;
@@ -20,6 +20,32 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
             } else {
                 eprintln!("{name}: created");
             }
+        }
+        Collections::Set { name, up, no_wait } => {
+            let request = wire::UpdateCollectionRequest {
+                collection: name.clone(),
+                up: (*up).into(),
+            };
+            let done = call!(session.client, UpdateCollection(request))?;
+            if !no_wait {
+                session.wait_until_idle(name)?;
+            }
+            let described = session.describe(name)?;
+            if session.json {
+                let mut value = json::collection(&described);
+                value["changed"] = done.changed.into();
+                session.print_json(&value)?;
+            } else {
+                let (axis, undo) = (json::up(*up), "`coseg undo` takes this back");
+                eprintln!(
+                    "{}",
+                    match done.changed {
+                        true => format!("{name}: up is {axis} now; {undo}"),
+                        false => format!("{name}: up is {axis} already"),
+                    }
+                );
+            }
+            warn_of_up(&described);
         }
         Collections::Delete { name, yes } => {
             let about = session.describe(name)?;
@@ -44,4 +70,56 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
         }
     }
     Ok(true)
+}
+
+/// Says on stderr if shapes seem to stand along another axis than the collection's.
+pub(crate) fn warn_of_up(c: &wire::Collection) {
+    if let Some(text) = up_warning(c) {
+        eprintln!("coseg: warning: {text}");
+    }
+}
+
+/// What to say if shapes seem to stand along another axis than the one that was given, and what to do about it.
+pub(crate) fn up_warning(c: &wire::Collection) -> Option<String> {
+    let other = c.up_disagrees.as_ref()?;
+    let spec = c.spec.as_ref()?;
+    let (given, axis) = (json::up(spec.up()), json::up(other.up()));
+    let percent = 100.0 * other.agreement;
+    let name = &spec.name;
+    let word = |c: char| c.is_alphanumeric() || "-_.".contains(c);
+    let quoted = match name.chars().all(word) && !name.starts_with('-') {
+        true => name.clone(),
+        false => format!("'{}'", name.replace('\'', r"'\''")),
+    };
+    Some(format!(
+        "{name} was given up {given}, but {percent:.0} % of its shapes stand along {axis}; if they do, \
+         `coseg collections set {quoted} --up {axis}` finds the labels again"
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::up_warning;
+    use coseg::ipc::wire;
+
+    #[test]
+    fn the_warning_names_both_axes_and_the_command() {
+        let mut c = wire::Collection {
+            spec: Some(wire::CollectionSpec {
+                name: "old chairs".to_owned(),
+                up: wire::Up::PlusY.into(),
+                ..wire::CollectionSpec::default()
+            }),
+            ..wire::Collection::default()
+        };
+        assert_eq!(up_warning(&c), None);
+        c.up_disagrees = Some(wire::UpEstimate {
+            up: wire::Up::PlusZ.into(),
+            agreement: 0.9,
+        });
+        let text = up_warning(&c).unwrap();
+        for part in ["+y", "90 %", "+z", "collections set 'old chairs' --up +z"] {
+            assert!(text.contains(part), "{text}");
+        }
+    }
 }

@@ -1,5 +1,6 @@
 //! `coseg ls`: collections, or the shapes of one.
 
+use super::collections::warn_of_up;
 use super::session::{Session, table};
 use super::{Outcome, json};
 use crate::cli::Ls;
@@ -22,6 +23,7 @@ fn collections(session: &mut Session) -> Outcome {
         session.client,
         ListCollections(wire::ListCollectionsRequest {})
     )?;
+    reply.collections.iter().for_each(warn_of_up);
     if session.json {
         let list: Vec<Value> = reply.collections.iter().map(json::collection).collect();
         session.print_json(&json!({ "collections": list }))?;

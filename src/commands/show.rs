@@ -1,5 +1,6 @@
 //! `coseg show`: one shape with its parts and sources, or one collection with its labels.
 
+use super::collections::warn_of_up;
 use super::session::{Session, table};
 use super::{Outcome, json};
 use crate::cli::Show;
@@ -32,6 +33,7 @@ fn label_name(collection: &wire::Collection, id: u32) -> String {
 }
 
 fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
+    warn_of_up(c);
     if session.json {
         session.print_json(&json::collection(c))?;
         return Ok(true);

@@ -201,6 +201,7 @@ fn needed(body: &Body) -> Role {
         | Body::EventsSince(_) => Role::ReadOnly,
         Body::CreateCollection(_)
         | Body::NameLabel(_)
+        | Body::UpdateCollection(_)
         | Body::CorrectLabels(_)
         | Body::MergeLabels(_)
         | Body::SplitLabel(_)

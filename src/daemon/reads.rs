@@ -114,6 +114,7 @@ pub(crate) fn look_up(daemon: &Arc<Daemon>, body: Body) -> Result<Looked, wire::
         Body::CreateCollection(_)
         | Body::DeleteCollection(_)
         | Body::NameLabel(_)
+        | Body::UpdateCollection(_)
         | Body::CorrectLabels(_)
         | Body::MergeLabels(_)
         | Body::SplitLabel(_)

@@ -90,6 +90,7 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
         match body {
             Body::DeleteCollection(_)
             | Body::NameLabel(_)
+            | Body::UpdateCollection(_)
             | Body::CorrectLabels(_)
             | Body::MergeLabels(_)
             | Body::SplitLabel(_)
@@ -215,6 +216,7 @@ fn changed_collection(body: &Body) -> Option<&str> {
     Some(match body {
         Body::DeleteCollection(r) => &r.collection,
         Body::NameLabel(r) => &r.collection,
+        Body::UpdateCollection(r) => &r.collection,
         Body::CorrectLabels(r) => &r.collection,
         Body::MergeLabels(r) => &r.collection,
         Body::SplitLabel(r) => &r.collection,

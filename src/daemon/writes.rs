@@ -75,7 +75,8 @@ pub(crate) fn change(
                 label: Some(convert::label_info(&label)),
             })
         }
-        Body::CorrectLabels(_)
+        Body::UpdateCollection(_)
+        | Body::CorrectLabels(_)
         | Body::MergeLabels(_)
         | Body::SplitLabel(_)
         | Body::Undo(_)

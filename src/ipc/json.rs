@@ -34,6 +34,11 @@ pub fn colour(rgb: u32) -> String {
     format!("#{:06x}", rgb & 0xff_ffff)
 }
 
+/// An estimate of which way is up.
+pub fn up_estimate(e: &wire::UpEstimate) -> Value {
+    json!({ "up": up(e.up()), "agreement": e.agreement })
+}
+
 /// A collection with its labels.
 pub fn collection(c: &wire::Collection) -> Value {
     let spec = c.spec.clone().unwrap_or_default();
@@ -41,12 +46,14 @@ pub fn collection(c: &wire::Collection) -> Value {
         "name": spec.name,
         "n_parts": spec.n_parts.filter(|&n| n > 0),
         "up": up(spec.up()),
-        "up_estimate": c.up_estimate.map(|e| json!({ "up": up(e.up()), "agreement": e.agreement })),
+        "up_estimate": c.up_estimate.as_ref().map(up_estimate),
+        "up_disagrees": c.up_disagrees.as_ref().map(up_estimate),
         "operator": short(spec.operator().as_str_name(), "OPERATOR_").replace('_', "-"),
         "working_faces": spec.working_faces,
         "sequence": c.sequence,
         "n_shapes": c.n_shapes,
         "n_stale": c.n_stale,
+        "n_undoable": c.n_undoable,
         "labels": c.labels.iter().map(label).collect::<Vec<_>>(),
     })
 }
@@ -217,6 +224,7 @@ pub fn event(e: &wire::Event) -> Value {
             ("corrected", body)
         }
         Some(Kind::Undone(u)) => ("undone", json!({ "change": u.change })),
+        Some(Kind::UpChanged(c)) => ("up_changed", json!({ "from": c.from, "to": c.to })),
         Some(Kind::Reclustered(r)) => {
             let body = json!({
                 "score_before": r.score_before,
@@ -283,6 +291,9 @@ pub fn event_line(e: &wire::Event) -> String {
             percent(c.area_share)
         ),
         Some(Kind::Undone(u)) => format!("{} undone", u.change),
+        Some(Kind::UpChanged(c)) => {
+            format!("up axis {} in place of {}", c.to, c.from)
+        }
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
             let before = r

@@ -27,4 +27,4 @@ pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, disc
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
 pub use prior::{Pinned, PriorLabels};
-pub use up::{UpVote, estimate_up};
+pub use up::{UpVote, contradicting_up, estimate_up};

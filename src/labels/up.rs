@@ -12,6 +12,12 @@ const UNSTABLE: f64 = 0.2;
 /// Least share of the shapes that must agree; of six axes one gets a sixth by chance.
 const LEAST_AGREEMENT: f64 = 0.5;
 
+/// A shape stands clearly better along another axis from this ratio of the two scores on. Tables stand about twice as well on
+/// their plate as on their feet; of chairs that lie on a side, more than half stand three times as well on their feet.
+const CLEARLY: f64 = 3.0;
+/// Fewest shapes that can contradict a given axis: a single one that lies on its side is no mistake of the collection.
+const LEAST_SHAPES: usize = 3;
+
 /// The axis that most shapes of a collection stand along.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpVote {
@@ -30,16 +36,39 @@ impl UpVote {
 
 /// The axis that most shapes stand along, and how many agree; `None` without shapes.
 pub fn estimate_up<'a>(shapes: impl Iterator<Item = &'a DescriptionView<'a>>) -> Option<UpVote> {
-    let axes: [[f64; 3]; 6] = std::array::from_fn(|i| {
+    vote(shapes, |_, _| true)
+}
+
+/// The axis other than `given` along which most shapes stand clearly better, and their share of all; `None` if there are
+/// too few shapes to say. The given axis is probably wrong where this is [trusted](UpVote::trusted).
+pub fn contradicting_up<'a>(given: [f64; 3], shapes: &[&'a DescriptionView<'a>]) -> Option<UpVote> {
+    let at = axes().iter().position(|axis| *axis == given)?;
+    let better =
+        |scores: &[f64; 6], best: usize| best != at && scores[best] >= CLEARLY * scores[at];
+    let vote = vote(shapes.iter().copied(), better)?;
+    (shapes.len() >= LEAST_SHAPES).then_some(vote)
+}
+
+/// The coordinate axes: +x, -x, +y, -y, +z, -z.
+fn axes() -> [[f64; 3]; 6] {
+    std::array::from_fn(|i| {
         let mut axis = [0.0; 3];
         axis[i / 2] = if i % 2 == 0 { 1.0 } else { -1.0 };
         axis
-    });
+    })
+}
+
+/// The axis that gets most votes, and their share; each shape votes for the axis along which it stands best, if that `counts`.
+fn vote<'a>(
+    shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
+    counts: impl Fn(&[f64; 6], usize) -> bool,
+) -> Option<UpVote> {
+    let axes = axes();
     let (mut votes, mut sums, mut n) = ([0usize; 6], [0.0; 6], 0usize);
     for shape in shapes {
         let scores = axes.map(|axis| standing(shape, axis));
         let best = (0..6).max_by(|&a, &b| scores[a].total_cmp(&scores[b]).then(b.cmp(&a)))?;
-        votes[best] += 1;
+        votes[best] += usize::from(counts(&scores, best));
         n += 1;
         for (sum, score) in sums.iter_mut().zip(scores) {
             *sum += score;
@@ -185,5 +214,37 @@ mod tests {
         assert!((vote.agreement - 1.0 / 3.0).abs() < 1e-12);
         assert_eq!(vote.trusted(), None);
         assert_eq!(estimate_up([].iter()), None);
+    }
+
+    #[test]
+    fn a_given_axis_is_contradicted_by_shapes_that_stand_clearly_better_along_another() {
+        let [x, y, down] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]];
+        let shapes: Vec<Description> = (0..4).map(|i| pyramid(usize::from(i < 3), 1.0)).collect();
+        let views: Vec<DescriptionView<'_>> = shapes.iter().map(Description::view).collect();
+        let views: Vec<&DescriptionView<'_>> = views.iter().collect();
+        let vote = contradicting_up(x, &views).unwrap();
+        assert_eq!((vote.trusted(), vote.agreement), (Some(y), 0.75));
+        assert_eq!(contradicting_up(down, &views).unwrap().trusted(), Some(y));
+        // One shape of four is no mistake of the collection.
+        assert_eq!(contradicting_up(y, &views).unwrap().trusted(), None);
+        // Two shapes are too few, and so are axes between the coordinates.
+        assert_eq!(contradicting_up(x, &views[..2]), None);
+        assert_eq!(contradicting_up([0.6, 0.8, 0.0], &views), None);
+    }
+
+    #[test]
+    fn what_stands_on_every_side_contradicts_nothing() {
+        let mut cube = pyramid(0, 1.0);
+        cube.vertices.pop();
+        for i in 0..4 {
+            let [_, a, b] = cube.vertices[i];
+            cube.vertices.push([1.0, a, b]);
+        }
+        cube.mass = vec![0.125; 8];
+        let view = cube.view();
+        for given in axes() {
+            let vote = contradicting_up(given, &[&view; 3]).unwrap();
+            assert_eq!(vote.trusted(), None, "{given:?}");
+        }
     }
 }

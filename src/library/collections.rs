@@ -14,10 +14,8 @@ use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader, Tx};
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
-/// Most part kinds a collection can be given.
 /// Most kinds of parts that a collection can be told to have.
 pub const MAX_PARTS: u32 = 64;
-/// Characters of a shape's name.
 const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
 
 impl Library {
@@ -201,6 +199,14 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
             up: Up::along(up.vote().trusted()),
             agreement: up.agreement,
         }),
+        up_disagrees: state.up_disagrees.and_then(|other| {
+            let axis = other.vote().trusted()?;
+            Some(UpEstimate {
+                up: Up::along(Some(axis)),
+                agreement: other.agreement,
+            })
+        }),
+        n_undoable: reader.n_corrections(row.id)?,
         sequence: row.sequence,
         n_shapes: reader.n_shapes(row.id)?,
         n_stale: reader.n_stale(row.id)?,

@@ -159,6 +159,7 @@ pub(super) fn event(tx: &Tx<'_>, collection: CollectionId, kind: &EventKind) -> 
         EventKind::LabelRetired { .. } => "label_retired",
         EventKind::Corrected { .. } => "corrected",
         EventKind::Undone { .. } => "undone",
+        EventKind::UpChanged { .. } => "up_changed",
         EventKind::Reclustered { .. } => "reclustered",
     };
     Ok(tx.append_event(collection, name, &to_json(kind))?)
@@ -186,7 +187,11 @@ pub(super) fn put_relabelled(
     Ok(tx.put_labels(relabelled.shape, &labels.row, &labels.summary)?)
 }
 
-fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> Result<()> {
+pub(super) fn label_change(
+    tx: &Tx<'_>,
+    collection: CollectionId,
+    change: &LabelChange,
+) -> Result<()> {
     match *change {
         LabelChange::Created(id) => {
             let taken = tx.take_labels(collection, 1)?;

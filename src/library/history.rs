@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 /// What was undone.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
-    /// The change: `correct`, `name`, `merge` or `split`.
+    /// The change: `correct`, `name`, `merge`, `split` or `up`.
     pub change: String,
     /// Changes by a person that can still be undone.
     pub n_left: u64,
@@ -27,6 +27,9 @@ pub(super) struct Before {
     labels: Vec<StoredLabel>,
     /// `None`: the change concerns names only.
     rest: Option<Rest>,
+    /// Which way was up, if the change concerns that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    up: Option<String>,
     #[serde(skip)]
     model: Vec<u8>,
 }
@@ -57,8 +60,17 @@ impl Before {
         Self {
             labels: labels.into_iter().map(StoredLabel::from).collect(),
             rest: None,
+            up: None,
             model: Vec::new(),
         }
+    }
+
+    /// Before another way is up.
+    pub(super) fn up(reader: &Reader<'_>, lane: &Lane) -> Result<Self> {
+        Ok(Self {
+            up: Some(lane.row.up.clone()),
+            ..Self::labels(reader, lane, &[])?
+        })
     }
 
     /// Before a change that touches the pinned faces of `shapes`.
@@ -121,8 +133,8 @@ struct Restored {
 }
 
 impl Library {
-    /// Undoes the newest change that a person made to a collection: a correction, a name, a merge or a split. Shapes
-    /// have the labels again that they had before it; those that came since are labelled anew. May be repeated, back
+    /// Undoes the newest change that a person made to a collection: a correction, a name, a merge, a split or another up axis.
+    /// Shapes have the labels again that they had before it; those that came since are labelled anew. May be repeated, back
     /// to the first change; cannot itself be undone.
     ///
     /// # Errors
@@ -184,6 +196,9 @@ impl Library {
                     tx.set_state(id, to_json(&state).as_bytes())?;
                     tx.set_model(id, &before.model)?;
                     tx.set_epoch(id, rest.epoch)?;
+                }
+                if let Some(up) = &before.up {
+                    tx.set_parameters(id, lane.row.n_parts, up)?;
                 }
                 // Only now: the labels above were not to be noted with an older change.
                 tx.delete_correction(newest.id)?;

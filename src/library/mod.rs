@@ -53,6 +53,7 @@ mod submit;
 mod suggest;
 mod teach;
 mod types;
+mod upright;
 
 pub use agreement::Disagreement;
 pub use apart::{HandedOver, state_from_json, state_to_json};
@@ -61,12 +62,11 @@ pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::LibraryError;
 pub use history::Undone;
 pub use jobs::JobFilter;
-pub use names::shown;
+pub use names::{check_shape_name, shown};
 pub use place::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use points::{PointRequest, PolygonValues};
 pub use repair::Repaired;
 pub use rows::report_to_json;
-pub(crate) use submit::check_shape_name;
 pub use submit::{KeptShapes, Submission};
 pub use suggest::Suggestion;
 pub use types::{
@@ -74,6 +74,7 @@ pub use types::{
     Job, JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
     PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up, UpEstimate,
 };
+pub use upright::UpSet;
 
 use crate::pipeline::Description;
 use crate::store::check::Finding;

@@ -7,6 +7,17 @@ use std::borrow::Cow;
 const LOOKALIKES: &str = "АВЕКМНОРСТУХаеорсухіІјЈѕЅһԁԛԜԝҮүӀӏ\
                           ΑΒΕΖΗΙΚΜΝΟΡΤΥΧοναινυρ";
 
+/// Characters of a shape's name.
+const MAX_SHAPE_NAME: usize = 255;
+
+/// Refuses what cannot be the name of a shape.
+///
+/// # Errors
+/// The name is too long, empty, or has characters that are not allowed.
+pub fn check_shape_name(name: &str) -> Result<()> {
+    check_name("shape", name, MAX_SHAPE_NAME)
+}
+
 /// Refuses a name that is too long, cannot stand in a path, or has characters that nobody sees.
 pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
     let bad = |message: String| Err(LibraryError::invalid("BAD_NAME", message));

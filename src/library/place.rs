@@ -4,13 +4,13 @@ use super::commit::Commit;
 use super::lane::{KnownShape, Lane};
 use super::learnt::Learnt;
 use super::relabel::face_ids;
-use super::rows::{CollectionState, UpState, damaged};
-use super::{Described, Library, Outcome, Placed, Result, Source};
+use super::rows::{CollectionState, UpFound, damaged};
+use super::{Described, Library, Outcome, Placed, Result, Source, Up};
 use crate::fmap::{FunctionalMap, MapOptions};
 use crate::labels::DiscoveryOptions;
 use crate::pipeline::{
-    DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Representative, Vote,
-    label, map, recluster, unlikeness,
+    DescriptionView, LabelChange, Labelling, Prepared, ReclusterOptions, Reclustering,
+    Representative, Vote, label, map, recluster, unlikeness,
 };
 use crate::store::{
     Digest, JobItemRow, LabelVersionRow, MappedDescription, NewShapeRow, ObjectKind, ObjectRow,
@@ -52,6 +52,27 @@ pub(super) struct Plan {
     pub(super) reclustered: Option<(f64, f64, bool)>,
     /// Whether what a person said is to be learnt anew, now that the collection has grown.
     pub(super) teach_again: bool,
+}
+
+/// A shape that is clustered with the stored ones.
+pub(super) struct NewShape<'a> {
+    view: &'a DescriptionView<'a>,
+    /// Of its original bytes.
+    digest: Digest,
+    /// Its labels by the model that there is.
+    labelling: Option<&'a Labelling>,
+}
+
+/// Representatives that were clustered together.
+pub(super) struct Clustered {
+    /// Their indices in the lane.
+    pub(super) chosen: Vec<usize>,
+    pub(super) known: Vec<Known>,
+    /// Where among them the new shape is.
+    new_at: usize,
+    /// What they say of the up axis.
+    pub(super) up: UpFound,
+    pub(super) outcome: Reclustering,
 }
 
 impl Library {
@@ -112,7 +133,7 @@ impl Library {
         let n_inconsistent = self.n_inconsistent(&maps)?;
         lap("place");
         let due = lane.shapes.len() as u64 + 1 >= lane.state.next_recluster;
-        let plan = match (taught, labelling, &lane.learnt) {
+        let mut plan = match (taught, labelling, &lane.learnt) {
             (Some(taught), ..) => {
                 (maps, sources) = (taught.maps, taught.sources);
                 taught.plan
@@ -122,6 +143,10 @@ impl Library {
                 self.reclustered(lane, (&view, accepted.item.original_digest), labelling)?
             }
         };
+        if plan.state.up_disagrees.is_none() && lane.up().axis().is_some() {
+            // As in collections that were begun when nobody asked.
+            plan.state.up_disagrees = self.up_found(lane, lane.up(), Some(&view))?.disagrees;
+        }
         lap("recluster");
         n_relabelled += plan.relabelled.len() as u32;
         let original = || self.original_bytes(&accepted.item.original_digest);
@@ -131,7 +156,7 @@ impl Library {
             &plan.learnt.model.labels,
             (&original, &accepted.item.format),
         )?;
-        let relabelled = self.finish_relabelled(&plan)?;
+        let relabelled = self.finish_relabelled(&plan.relabelled, &plan.learnt.model.labels)?;
         lap("boundary");
         let shape = NewShapeRow {
             collection: lane.row.id,
@@ -227,9 +252,60 @@ impl Library {
         (view, digest): (&DescriptionView<'_>, Digest),
         labelling: Option<Labelling>,
     ) -> Result<Plan> {
+        let new = NewShape {
+            view,
+            digest,
+            labelling: labelling.as_ref(),
+        };
+        let n_shapes = lane.shapes.len() + 1;
+        let found = self.cluster(lane, lane.up(), min_gain(n_shapes), Some(&new))?;
+        let next_recluster = next_recluster(n_shapes as u64);
+        let scores = found.outcome.scores;
+        let reclustered = Some((scores.0, scores.1, found.outcome.accepted));
+        if let (false, Some(labelling), Some(learnt)) =
+            (found.outcome.accepted, labelling, &lane.learnt)
+        {
+            // The epoch goes on: what is stale is labelled by the model and the representatives that
+            // made it so, whether that happens before or after this.
+            let mut plan = grown(lane, learnt, labelling, view);
+            plan.state.next_recluster = next_recluster;
+            plan.state.up_disagrees = found.up.disagrees;
+            plan.reclustered = reclustered;
+            return Ok(plan);
+        }
+        let mut labellings = found.outcome.labellings;
+        let labelling = labellings.remove(found.new_at);
+        let ordinals = found
+            .chosen
+            .iter()
+            .map(|at| lane.shapes[*at].ordinal)
+            .chain([lane.row.next_ordinal]);
+        let state = found.up.noted(CollectionState {
+            next_recluster,
+            representatives: ordinals.collect(),
+            epoch_ordinal: lane.row.next_ordinal,
+            ..CollectionState::default()
+        });
+        Ok(Plan {
+            learnt: Learnt::begin(found.outcome.model),
+            state,
+            labelling,
+            relabelled: found.known.into_iter().zip(labellings).collect(),
+            changes: found.outcome.changes,
+            reclustered,
+            teach_again: false,
+        })
+    }
+
+    /// Clusters the parts of the representatives, and of a new shape if there is one, along the axis that is `up`.
+    pub(super) fn cluster(
+        &self,
+        lane: &mut Lane,
+        up: Up,
+        min_gain: f64,
+        new: Option<&NewShape<'_>>,
+    ) -> Result<Clustered> {
         let chosen = lane.representatives(MAX_REPRESENTATIVES);
-        // The new shape, too, has its place by its digest.
-        let new_at = chosen.partition_point(|at| lane.shapes[*at].digest <= digest);
         for &at in &chosen {
             self.relabel(lane, at)?;
         }
@@ -246,7 +322,7 @@ impl Library {
                 .map(|c| labels[*c as usize])
                 .collect()
         };
-        let new_ids = labelling.as_ref().map(ids).unwrap_or_default();
+        let new_ids = new.and_then(|n| n.labelling).map(ids).unwrap_or_default();
         let known_ids: Vec<Vec<u32>> = known
             .iter()
             .map(|k| face_ids(&k.labels.proxy_labels))
@@ -259,58 +335,53 @@ impl Library {
                 labels,
             })
             .collect();
-        let new = Representative {
-            shape: *view,
-            labels: &new_ids,
-        };
-        shapes.insert(new_at, new);
-        let n_labels = lane.row.n_parts.map(|n| n as usize);
-        let (up_state, up) = UpState::of(lane.up(), shapes.iter().map(|s| &s.shape));
+        let mut new_at = chosen.len();
+        if let Some(new) = new {
+            // The new shape, too, has its place by its digest.
+            new_at = chosen.partition_point(|at| lane.shapes[*at].digest <= new.digest);
+            let new = Representative {
+                shape: *new.view,
+                labels: &new_ids,
+            };
+            shapes.insert(new_at, new);
+        }
+        let up = UpFound::of(up, &shapes.iter().map(|s| &s.shape).collect::<Vec<_>>());
         let options = ReclusterOptions {
             discovery: DiscoveryOptions {
-                n_labels,
+                n_labels: lane.row.n_parts.map(|n| n as usize),
                 ..DiscoveryOptions::default()
             },
-            up,
-            min_gain: min_gain(lane.shapes.len() + 1),
+            up: up.axis,
+            min_gain,
             next_label: lane.row.next_label,
         };
-        let epoch = old.map_or(0, |m| m.epoch) + 1;
-        let outcome = recluster(&shapes, old, epoch, &options);
-        let n_shapes = lane.shapes.len() as u64 + 1;
-        let next_recluster = next_recluster(n_shapes);
-        let reclustered = Some((outcome.scores.0, outcome.scores.1, outcome.accepted));
-        if let (false, Some(labelling), Some(learnt)) = (outcome.accepted, labelling, &lane.learnt)
-        {
-            // The epoch goes on: what is stale is labelled by the model and the representatives that
-            // made it so, whether that happens before or after this.
-            let mut plan = grown(lane, learnt, labelling, view);
-            plan.state.next_recluster = next_recluster;
-            plan.reclustered = reclustered;
-            return Ok(plan);
-        }
-        let mut labellings = outcome.labellings;
-        let labelling = labellings.remove(new_at);
-        let ordinals = chosen
-            .iter()
-            .map(|at| lane.shapes[*at].ordinal)
-            .chain([lane.row.next_ordinal]);
-        let state = CollectionState {
-            next_recluster,
-            representatives: ordinals.collect(),
-            epoch_ordinal: lane.row.next_ordinal,
-            up: up_state,
-            ..CollectionState::default()
-        };
-        Ok(Plan {
-            learnt: Learnt::begin(outcome.model),
-            state,
-            labelling,
-            relabelled: known.into_iter().zip(labellings).collect(),
-            changes: outcome.changes,
-            reclustered,
-            teach_again: false,
+        let outcome = recluster(&shapes, old, old.map_or(0, |m| m.epoch) + 1, &options);
+        Ok(Clustered {
+            chosen,
+            known,
+            new_at,
+            up,
+            outcome,
         })
+    }
+
+    /// What the representatives, and a new shape if there is one, say where `up` is given.
+    pub(super) fn up_found(
+        &self,
+        lane: &Lane,
+        up: Up,
+        new: Option<&DescriptionView<'_>>,
+    ) -> Result<UpFound> {
+        let chosen = lane.representatives(MAX_REPRESENTATIVES);
+        let known: Vec<Known> = chosen
+            .iter()
+            .map(|at| self.known(lane.shapes[*at].id))
+            .collect::<Result<_>>()?;
+        let views: Vec<DescriptionView<'_>> = known.iter().map(|k| k.mapped.view()).collect();
+        Ok(UpFound::of(
+            up,
+            &views.iter().chain(new).collect::<Vec<_>>(),
+        ))
     }
 
     /// Takes a shape out of the lane, before it is replaced or removed. Whether a person had labelled faces of it.

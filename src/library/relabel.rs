@@ -2,7 +2,7 @@
 
 use super::carry::MapIn;
 use super::lane::Lane;
-use super::place::{Known, Plan, sources_of};
+use super::place::{Known, sources_of};
 use super::rows::{format_from_name, to_json};
 use super::{LabelId, LabelMove, Library, PartInfo, Result, Source};
 use crate::correspondence::parts;
@@ -107,11 +107,14 @@ impl Library {
         })
     }
 
-    /// The stored shapes of a plan whose labels really change.
-    pub(super) fn finish_relabelled(&self, plan: &Plan) -> Result<Vec<Relabelled>> {
-        let ids = &plan.learnt.model.labels;
+    /// New versions of the labels of stored shapes that were clustered anew.
+    pub(super) fn finish_relabelled(
+        &self,
+        relabelled: &[(Known, Labelling)],
+        ids: &[LabelId],
+    ) -> Result<Vec<Relabelled>> {
         let mut out = Vec::new();
-        for (known, labelling) in &plan.relabelled {
+        for (known, labelling) in relabelled {
             out.push(self.relabelled(known, labelling, ids)?);
         }
         Ok(out)

@@ -3,7 +3,7 @@
 use super::{LibraryError, Result, Up};
 use crate::description::DescriptionView;
 use crate::fmap::{Confidence, Quality, confidence};
-use crate::labels::{UpVote, estimate_up};
+use crate::labels::{UpVote, contradicting_up, estimate_up};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use crate::store::{CollectionRow, MapRow, StoreError};
@@ -28,6 +28,9 @@ pub(super) struct CollectionState {
     /// Where the up axis is estimated: what the shapes that the model was made of say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) up: Option<UpState>,
+    /// Where the up axis is given: another one, along which shapes stand clearly better, and the share of those.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) up_disagrees: Option<UpState>,
     /// The newest job that carries a correction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) carrying: Option<CarryingState>,
@@ -63,23 +66,57 @@ pub(super) struct UpState {
     pub(super) agreement: f64,
 }
 
-impl UpState {
-    /// What shapes say, and the axis that follows from it or from what is given.
-    pub(super) fn of<'a>(
-        given: Up,
-        shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
-    ) -> (Option<Self>, Option<[f64; 3]>) {
-        if given != Up::Auto {
-            return (None, given.axis());
+/// What shapes say of the up axis of their collection, and the axis that follows.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct UpFound {
+    /// The axis that is used, if any.
+    pub(super) axis: Option<[f64; 3]>,
+    /// As [`CollectionState::up`].
+    pub(super) estimate: Option<UpState>,
+    /// As [`CollectionState::up_disagrees`].
+    pub(super) disagrees: Option<UpState>,
+}
+
+impl UpFound {
+    /// What shapes say where this is `given`.
+    pub(super) fn of<'a>(given: Up, shapes: &[&'a DescriptionView<'a>]) -> Self {
+        if given == Up::Auto {
+            let vote = estimate_up(shapes.iter().copied());
+            return Self {
+                axis: vote.and_then(|v| v.trusted()),
+                estimate: vote.map(UpState::from),
+                disagrees: None,
+            };
         }
-        let vote = estimate_up(shapes);
-        let said = vote.map(|v| Self {
-            axis: v.axis,
-            agreement: v.agreement,
-        });
-        (said, vote.and_then(|v| v.trusted()))
+        let axis = given.axis();
+        let vote = axis.and_then(|axis| contradicting_up(axis, shapes));
+        Self {
+            axis,
+            estimate: None,
+            disagrees: vote.map(UpState::from),
+        }
     }
 
+    /// The state of a collection with what was found.
+    pub(super) fn noted(self, state: CollectionState) -> CollectionState {
+        CollectionState {
+            up: self.estimate,
+            up_disagrees: self.disagrees,
+            ..state
+        }
+    }
+}
+
+impl From<UpVote> for UpState {
+    fn from(vote: UpVote) -> Self {
+        Self {
+            axis: vote.axis,
+            agreement: vote.agreement,
+        }
+    }
+}
+
+impl UpState {
     /// As a vote.
     pub(super) fn vote(&self) -> UpVote {
         UpVote {

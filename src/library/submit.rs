@@ -2,7 +2,7 @@
 
 use super::isolate::DescribeJob;
 use super::jobs::Attempts;
-use super::names::check_name;
+use super::names::check_shape_name;
 use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
 use super::{
     Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,
@@ -58,11 +58,6 @@ impl Submission<'_> {
         }
         Digest(*request.finalize().as_bytes())
     }
-}
-
-/// Refuses a name that no shape may have.
-pub(crate) fn check_shape_name(name: &str) -> Result<()> {
-    check_name("shape", name, MAX_SHAPE_NAME)
 }
 
 impl Library {

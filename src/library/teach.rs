@@ -9,7 +9,7 @@ use super::lane::Lane;
 use super::learnt::Learnt;
 use super::place::{Known, MAX_MAPS, MAX_REPRESENTATIVES};
 use super::relabel::Relabelled;
-use super::rows::{Teaching, UpState, damaged, to_json};
+use super::rows::{Teaching, UpFound, damaged, to_json};
 use super::{LabelId, Library, Result};
 use crate::fmap::FunctionalMap;
 use crate::labels::{Features, LabelModel, Normalisation, Statistics};
@@ -74,7 +74,8 @@ impl Library {
             .map(|at| self.known(lane.shapes[*at].id))
             .collect::<Result<_>>()?;
         let views: Vec<DescriptionView<'_>> = known.iter().map(|k| k.mapped.view()).collect();
-        let (up_state, up) = UpState::of(lane.up(), views.iter());
+        let found = UpFound::of(lane.up(), &views.iter().collect::<Vec<_>>());
+        let up = found.axis;
         let parts: Vec<(Features, Surface)> = views
             .par_iter()
             .map(|v| (Features::raw(v, up), Surface::new(&v.mesh())))
@@ -90,8 +91,7 @@ impl Library {
             up,
         };
         let learnt = Learnt::begin(model);
-        let mut state = lane.state.clone();
-        state.up = up_state;
+        let mut state = found.noted(lane.state.clone());
         if let Some(teaching) = &mut state.teaching {
             teaching.normalised = true;
         }

@@ -106,6 +106,10 @@ pub struct CollectionInfo {
     pub labels: Vec<LabelInfo>,
     /// Where the up axis is estimated, and there are shapes to estimate it from: the estimate in force.
     pub up_estimate: Option<UpEstimate>,
+    /// Where the up axis is given, and at least half of the shapes stand clearly better along one other axis: that one.
+    pub up_disagrees: Option<UpEstimate>,
+    /// Changes by a person that can be undone.
+    pub n_undoable: u64,
 }
 
 /// An estimate of which way is up.
@@ -415,8 +419,15 @@ pub enum EventKind {
     },
     /// The newest change by a person was undone.
     Undone {
-        /// What it was: `correct`, `name`, `merge` or `split`.
+        /// What it was: `correct`, `name`, `merge`, `split` or `up`.
         change: String,
+    },
+    /// A person changed which way is up; labels are derived again along the new axis.
+    UpChanged {
+        /// As it was: `+y`, `unknown`, `auto`.
+        from: String,
+        /// As it is.
+        to: String,
     },
     /// The parts of the collection were clustered anew.
     Reclustered {

@@ -13,6 +13,7 @@ mod repeats;
 mod security;
 mod stages;
 mod stopped;
+mod upright;
 
 use crate::harness::{DEADLINE, Home, add, add_request, additions, refusal, skittle, wait_idle};
 use coseg::call;

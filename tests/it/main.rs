@@ -17,4 +17,5 @@ mod snapshot;
 mod spectra;
 mod store;
 mod tidy;
+mod upright;
 mod viewing;

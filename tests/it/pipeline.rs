@@ -66,7 +66,7 @@ pub(crate) fn all_labels(library: &Library) -> BTreeMap<String, Vec<i32>> {
         .collect()
 }
 
-fn accuracy(library: &Library, shapes: &[Labelled]) -> Score {
+pub(crate) fn accuracy(library: &Library, shapes: &[Labelled]) -> Score {
     let found = all_labels(library);
     let truth: Vec<Vec<i32>> = shapes
         .iter()

@@ -39,8 +39,8 @@ out=${1:-$work/screenshots}
 mkdir -p "$out"
 out=$(cd "$out" && pwd)
 
-cp tests/viewer/package.json tests/viewer/viewer.mjs "$work/"
-(cd "$work" && npm install --silent --no-audit --no-fund) || { echo "tests/viewer: playwright-core cannot be installed" >&2; exit 2; }
+cp tests/viewer/package.json tests/viewer/*.mjs "$work/"
+(cd "$work" && npm install --silent --no-audit --no-fund) || { echo "tests/viewer: playwright-core and axe-core cannot be installed" >&2; exit 2; }
 
 export COSEG_ENDPOINT="ipc://$work/coseg.sock"
 "$coseg" serve --library "$work/library" --http 127.0.0.1:0 2>"$work/log" &
@@ -60,6 +60,9 @@ done
 "$coseg" synth candelabra --count 6 --faces 3000 --out "$work/candelabras" >/dev/null
 "$coseg" add "$work/chairs" --collection chairs --parts 4 --up +y --timeout 60 >/dev/null
 "$coseg" add "$work/candelabras" --collection candelabras --parts 3 --up +y --timeout 60 >/dev/null
+"$coseg" synth chair --count 5 --faces 1000 --out "$work/fallen" >/dev/null
+"$coseg" add "$work/fallen" --collection fallen --parts 4 --up -x --timeout 60 >/dev/null 2>"$work/warned"
+grep -q 'collections set fallen --up +y' "$work/warned" || { cat "$work/warned"; echo "tests/viewer: no warning of the up axis" >&2; exit 1; }
 "$coseg" view chairs -o "$work/chairs.html" --timeout 60
 
 (cd "$work" && COSEG_BIN="$coseg" node viewer.mjs all "$url" "$out" "$work/chairs.html")

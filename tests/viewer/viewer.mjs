@@ -10,6 +10,7 @@ import { execFileSync } from "node:child_process";
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 import { chromium } from "playwright-core";
+import { accessTests, violations } from "./access.mjs";
 
 const [what, url, out, file] = process.argv.slice(2);
 const coseg = (...args) => JSON.parse(execFileSync(process.env.COSEG_BIN, [...args, "--json", "--timeout", "60"], { encoding: "utf8" }));
@@ -150,6 +151,7 @@ if (what === "many") {
   await test("an empty library says what to do", async () => {
     const page = await open(url);
     assert.match(await page.textContent("#empty"), /coseg add/);
+    assert.deepEqual(await violations(page), []);
     await shot(page, "empty");
     assert.deepEqual(page.faults, []);
     await page.context().close();
@@ -304,6 +306,8 @@ if (what === "many") {
     assert.deepEqual(page.faults, []);
     await page.context().close();
   });
+
+  await accessTests({ test, open, coseg, shot, url, file: pathToFileURL(file).href, names });
 }
 
 await browser.close();

@@ -40,6 +40,7 @@ CALLS: dict[str, Call] = {
     "create_collection": lambda lib, _: lib.create("a").name,
     "list_collections": lambda lib, _: lib.collections(),
     "describe_collection": lambda _, c: c.info(),
+    "update_collection": lambda _, c: c.set(up="+z"),
     "delete_collection": lambda _, c: c.delete(),
     "name_label": lambda _, c: c.name_label(1, "leg"),
     "add_shapes": lambda _, c: c.submit([("a", coseg.Encoded("off", b"OFF"))]),

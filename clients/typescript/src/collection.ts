@@ -9,7 +9,7 @@ import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import { EventSchema } from "./gen/coseg/v1/event_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
 import { PACE_MS, WAIT_MS, type Library } from "./library.js";
-import { added, failed, functionalMap, job, mapQuality, pointOptions, present } from "./replies.js";
+import { added, failed, functionalMap, job, mapQuality, pointOptions, present, up } from "./replies.js";
 import type { Subscription } from "./transport.js";
 import type {
   Added,
@@ -27,12 +27,14 @@ import type {
   Neighbor,
   PartMatches,
   Points,
+  Settings,
   Shape,
   Snapshot,
   Spectrum,
   Suggestion,
   Transferred,
   Undone,
+  Updated,
 } from "./types.js";
 import { FrameWriter, formatName, plain, type Encoded, type Matrix, type Mesh } from "./wire.js";
 
@@ -54,6 +56,15 @@ export class Collection {
     const [{ collection }] = await this.library.call("describeCollection", { collection: this.name });
     if (collection === undefined) throw new BadReply("a described collection is missing");
     return plain(collection);
+  }
+
+  /**
+   * Changes which way is up: labels are found again along the new axis, and faces that were labelled by hand keep
+   * theirs. Shapes that are left to do follow in the background: {@link waitIdle}. Can be undone.
+   */
+  async set(settings: { readonly up: NonNullable<Settings["up"]> }): Promise<Updated> {
+    const request = { collection: this.name, up: up(settings.up) };
+    return plain((await this.library.call("updateCollection", request))[0]);
   }
 
   /** Deletes the collection with its shapes, labels and events. */
@@ -375,7 +386,7 @@ export class Collection {
     return found[0]!;
   }
 
-  /** Takes back the newest correction, name, merge or split. */
+  /** Takes back the newest correction, name, merge, split or change of the up axis. */
   async undo(): Promise<Undone> {
     return plain((await this.library.call("undo", { collection: this.name }))[0]);
   }

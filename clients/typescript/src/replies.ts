@@ -11,17 +11,21 @@ import { plain, type Raw } from "./wire.js";
 /** Most kinds of parts that a collection can be told to have. */
 const MAX_PARTS = 64;
 
+export function up(name: Settings["up"]): Up {
+  const key = name?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
+  return key === undefined ? Up.UNSPECIFIED : Up[key];
+}
+
 export function spec(settings: Settings): CollectionSpec {
   const { parts } = settings;
   if (parts !== undefined && !(Number.isInteger(parts) && parts >= 0 && parts <= MAX_PARTS)) {
     throw new CosegError(`parts is ${parts}, but must be 1 to ${MAX_PARTS}, or 0: estimated`);
   }
-  const up = settings.up?.toUpperCase().replace("+", "PLUS_").replace("-", "MINUS_") as keyof typeof Up | undefined;
   const operator = settings.operator?.toUpperCase().replace("-", "_") as keyof typeof Operator | undefined;
   return create(CollectionSpecSchema, {
     ...(settings.parts !== undefined && { nParts: settings.parts }),
     workingFaces: settings.workingFaces ?? 0,
-    up: up === undefined ? Up.UNSPECIFIED : Up[up],
+    up: up(settings.up),
     operator: operator === undefined ? Operator.UNSPECIFIED : Operator[operator],
   });
 }

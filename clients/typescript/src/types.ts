@@ -6,7 +6,7 @@ import type {
   MapQuality as WireMapQuality,
   Neighbor as WireNeighbor,
 } from "./gen/coseg/v1/analysis_pb.js";
-import type { Collection as WireCollection, LabelInfo } from "./gen/coseg/v1/collection_pb.js";
+import type { Collection as WireCollection, LabelInfo, UpdateCollectionReply } from "./gen/coseg/v1/collection_pb.js";
 import type { CorrectLabelsReply, SuggestNextReply, UndoReply } from "./gen/coseg/v1/correction_pb.js";
 import type { HelloReply, StatsReply } from "./gen/coseg/v1/daemon_pb.js";
 import type { Event as WireEvent } from "./gen/coseg/v1/event_pb.js";
@@ -45,6 +45,8 @@ export type MapQuality = Plain<WireMapQuality>;
 export type MapAgreement = Plain<WireMapAgreement>;
 /** What was undone. */
 export type Undone = Plain<UndoReply>;
+/** What became of a change of a collection's settings, and how many shapes wait to be relabelled. */
+export type Updated = Plain<UpdateCollectionReply>;
 /** The shape whose labelling by a person would help most. */
 export type Suggestion = Plain<SuggestNextReply>;
 /** Whether a collection has anything left to do. */

@@ -41,6 +41,7 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   createCollection: async (lib) => (await lib.create("a")).name,
   listCollections: (lib) => lib.collections(),
   describeCollection: (_, c) => c.info(),
+  updateCollection: (_, c) => c.set({ up: "+z" }),
   deleteCollection: (_, c) => c.delete(),
   nameLabel: (_, c) => c.nameLabel(1, "leg"),
   addShapes: (_, c) => c.submit([["a", { format: "off", data: new Uint8Array(3) }]]),

@@ -138,14 +138,24 @@ fn unknown(path: &str) -> wire::Error {
 async fn library(server: &Server) -> Answer {
     let request = wire::ListCollectionsRequest {};
     let (reply, _) = ask!(server, ListCollections(request))?;
-    let (queued, at_work) = {
+    let (queues, queued, at_work) = {
         let progress = server.daemon.work.progress();
-        (progress.n_live(None), progress.n_at_stages())
+        let of = |c: &wire::Collection| {
+            progress.n_live(c.spec.as_ref().map(|s| s.name.as_str()))
+        };
+        let queues: Vec<usize> = reply.collections.iter().map(of).collect();
+        (queues, progress.n_live(None), progress.n_at_stages())
     };
     let instance = server.daemon.instance.clone();
     let edit = server.check_edit().is_ok();
     json_of(server, move || {
-        let collections: Vec<Value> = reply.collections.iter().map(json::collection).collect();
+        let about = |(c, n_queued): (&wire::Collection, usize)| {
+            let mut about = json::collection(c);
+            about["n_queued"] = n_queued.into();
+            about
+        };
+        let collections = reply.collections.iter().zip(queues);
+        let collections: Vec<Value> = collections.map(about).collect();
         json!({
             "version": env!("CARGO_PKG_VERSION"),
             "instance": instance,

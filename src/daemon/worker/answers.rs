@@ -23,6 +23,7 @@ pub(crate) fn subjects(body: &Body) -> (&str, Vec<&str>) {
         Body::Nearest(r) => (&r.collection, vec![&r.shape]),
         Body::GetPortraits(r) => (&r.collection, r.shapes.iter().map(String::as_str).collect()),
         Body::SuggestNext(r) => (&r.collection, Vec::new()),
+        Body::UpdateCollection(r) => (&r.collection, Vec::new()),
         Body::CorrectLabels(r) => (&r.collection, vec![&r.shape]),
         Body::MergeLabels(r) => (&r.collection, Vec::new()),
         Body::SplitLabel(r) => (&r.collection, Vec::new()),
@@ -90,6 +91,11 @@ pub(super) fn answer(library: &Library, request: &wire::Request, sent: &[Bytes])
         Body::SuggestNext(r) => {
             let suggestion = library.suggest(&r.collection).map_err(refuse)?;
             Reply::SuggestNext(convert::suggested(&suggestion))
+        }
+        Body::UpdateCollection(r) => {
+            let up = convert::new_up(r)?;
+            let done = library.set_up(&r.collection, up, key).map_err(refuse)?;
+            Reply::UpdateCollection(convert::updated(&done))
         }
         Body::CorrectLabels(r) => {
             let correction = convert::correction(r, FrameReader::new(sent))?;

@@ -2,7 +2,7 @@
 
 use super::errors::field_error;
 use crate::ipc::wire;
-use crate::library::{CollectionInfo, CollectionSpec, LabelInfo, Up};
+use crate::library::{CollectionInfo, CollectionSpec, LabelInfo, Up, UpEstimate, UpSet};
 use crate::operators::Operator;
 
 fn up_to_wire(up: Up) -> wire::Up {
@@ -26,31 +26,53 @@ fn operator_to_wire(operator: Operator) -> wire::Operator {
     }
 }
 
-/// What to create; fields that are not given take their defaults.
-pub fn collection_spec(
-    spec: &wire::CollectionSpec,
-    field: &str,
-) -> Result<CollectionSpec, wire::Error> {
-    let range = |name: &str, value: i32| {
-        let field = format!("{field}.{name}");
-        field_error(
-            wire::ErrorReason::FieldRange,
-            &field,
-            format!("{field} is {value}, which this version does not know"),
-        )
-    };
-    let up = match wire::Up::try_from(spec.up).map_err(|_| range("up", spec.up))? {
+fn unknown_value(field: &str, value: i32) -> wire::Error {
+    let text = format!("{field} is {value}, which this version does not know");
+    field_error(wire::ErrorReason::FieldRange, field, text)
+}
+
+/// An up axis, if it is given.
+fn up_of(value: i32, field: &str) -> Result<Option<Up>, wire::Error> {
+    let up = wire::Up::try_from(value).map_err(|_| unknown_value(field, value))?;
+    Ok(Some(match up {
+        wire::Up::Unspecified => return Ok(None),
         wire::Up::PlusX => Up::PlusX,
         wire::Up::MinusX => Up::MinusX,
         wire::Up::PlusY => Up::PlusY,
         wire::Up::MinusY => Up::MinusY,
         wire::Up::PlusZ => Up::PlusZ,
         wire::Up::MinusZ => Up::MinusZ,
-        wire::Up::Unspecified | wire::Up::Unknown => Up::Unknown,
+        wire::Up::Unknown => Up::Unknown,
         wire::Up::Auto => Up::Auto,
+    }))
+}
+
+/// The up axis that a collection is to have.
+pub fn new_up(request: &wire::UpdateCollectionRequest) -> Result<Up, wire::Error> {
+    let missing = || {
+        let text = "up is missing; it is what can be changed";
+        field_error(wire::ErrorReason::FieldMissing, "up", text)
     };
-    let operator =
-        wire::Operator::try_from(spec.operator).map_err(|_| range("operator", spec.operator))?;
+    up_of(request.up, "up")?.ok_or_else(missing)
+}
+
+/// What became of a change of the up axis.
+pub fn updated(done: &UpSet) -> wire::UpdateCollectionReply {
+    wire::UpdateCollectionReply {
+        changed: done.changed,
+        n_stale: done.n_stale,
+        sequence: done.sequence,
+    }
+}
+
+/// What to create; fields that are not given take their defaults.
+pub fn collection_spec(
+    spec: &wire::CollectionSpec,
+    field: &str,
+) -> Result<CollectionSpec, wire::Error> {
+    let up = up_of(spec.up, &format!("{field}.up"))?.unwrap_or_default();
+    let operator = wire::Operator::try_from(spec.operator)
+        .map_err(|_| unknown_value(&format!("{field}.operator"), spec.operator))?;
     let operator = match operator {
         wire::Operator::Unspecified | wire::Operator::Tufted => Operator::Tufted,
         wire::Operator::Cotan => Operator::Cotan,
@@ -144,6 +166,13 @@ pub fn label_info(label: &LabelInfo) -> wire::LabelInfo {
     }
 }
 
+fn estimate_to_wire(estimate: UpEstimate) -> wire::UpEstimate {
+    wire::UpEstimate {
+        up: up_to_wire(estimate.up).into(),
+        agreement: estimate.agreement,
+    }
+}
+
 /// A collection.
 pub fn collection(info: &CollectionInfo) -> wire::Collection {
     wire::Collection {
@@ -152,16 +181,15 @@ pub fn collection(info: &CollectionInfo) -> wire::Collection {
         n_shapes: info.n_shapes,
         n_stale: info.n_stale,
         labels: info.labels.iter().map(label_info).collect(),
-        up_estimate: info.up_estimate.map(|e| wire::UpEstimate {
-            up: up_to_wire(e.up).into(),
-            agreement: e.agreement,
-        }),
+        up_estimate: info.up_estimate.map(estimate_to_wire),
+        up_disagrees: info.up_disagrees.map(estimate_to_wire),
+        n_undoable: info.n_undoable,
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{collection_differs, collection_spec, spec_to_wire};
+    use super::{collection_differs, collection_spec, new_up, spec_to_wire};
     use crate::ipc::wire;
     use crate::library::{CollectionSpec, Up};
 
@@ -210,5 +238,13 @@ mod tests {
             "spec.up is 99, which this version does not know"
         );
         assert_eq!(error.reason(), wire::ErrorReason::FieldRange);
+        let request = |up| wire::UpdateCollectionRequest {
+            collection: String::new(),
+            up,
+        };
+        let reason = |up| new_up(&request(up)).unwrap_err().reason();
+        assert_eq!(reason(99), wire::ErrorReason::FieldRange);
+        assert_eq!(reason(0), wire::ErrorReason::FieldMissing);
+        assert_eq!(new_up(&request(wire::Up::Unknown.into())), Ok(Up::Unknown));
     }
 }

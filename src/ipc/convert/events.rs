@@ -79,6 +79,10 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
         EventKind::Undone { change } => Kind::Undone(wire::Undone {
             change: change.clone(),
         }),
+        EventKind::UpChanged { from, to } => Kind::UpChanged(wire::UpChanged {
+            from: from.clone(),
+            to: to.clone(),
+        }),
         EventKind::Reclustered {
             score_before,
             score_after,

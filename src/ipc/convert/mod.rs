@@ -14,7 +14,9 @@ pub use analysis::{
     point_maps, point_request, polygon_values, spectrum, transferred,
 };
 pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
-pub use collections::{collection, collection_differs, collection_spec, label_info};
+pub use collections::{
+    collection, collection_differs, collection_spec, label_info, new_up, updated,
+};
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{
     error, failure, field_error, frame_error, library_error, library_failure, with_subject,

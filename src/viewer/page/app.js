@@ -20,6 +20,8 @@ class App {
     this.gallery = new Gallery(this);
     this.stage = new Stage(this);
     this.panel = new Panel(this);
+    this.legend = new Legend(this);
+    this.view = readAddress("");
     this.listen();
   }
 
@@ -90,13 +92,11 @@ class App {
   async start() {
     const library = await this.source.library();
     this.setLibrary(library);
-    const [wanted] = this.address();
-    const names = library.collections.map((c) => c.name);
-    if (names.length === 0) {
+    if (library.collections.length === 0) {
       this.empty("The library is empty", "Add a folder of meshes, and they appear here as they are labelled.", "coseg add meshes/ --collection chairs");
       document.documentElement.dataset.ready = "empty";
     } else {
-      await this.load(names.includes(wanted) ? wanted : names[0]);
+      await this.follow();
     }
     if (this.source.live) this.look();
   }
@@ -118,36 +118,38 @@ class App {
   empty(title, text, command) {
     $("empty").hidden = !title;
     if (!title) return;
-    $("empty").replaceChildren(make("h2", {}, title), make("div", {}, text), command ? make("code", {}, command) : null);
+    const parts = [make("h2", {}, title), make("div", {}, text)];
+    if (command) parts.push(make("code", {}, command));
+    $("empty").replaceChildren(...parts);
   }
 
   async load(name) {
     this.name = name;
+    this.loaded = false;
     this.close();
     const ticket = (this.loading = {});
-    [this.portraits, this.cache, this.log, this.only] = [new Map(), new Map(), [], undefined];
+    [this.portraits, this.cache, this.log] = [new Map(), new Map(), []];
     $("collections").value = name;
-    document.title = `${name} – coseg viewer`;
     this.gallery.show([]);
     const found = await this.source.collection(name);
     if (this.loading !== ticket) return;
     this.setCollection(found);
-    let first = true;
     for await (const batch of this.source.portraits(name, this.shapes)) {
       if (this.loading !== ticket) return;
       for (const portrait of batch) {
         this.portraits.set(portrait.name, portrait);
         this.gallery.draw(portrait.name);
       }
-      if (first) this.restore();
-      first = false;
+      // The shape of the address as soon as it is there.
+      if (!this.selected && this.portraits.has(this.view.shape)) this.open();
       // Draw what is in sight before the next batch is read.
       await this.thumbnails.idle();
     }
+    if (this.loading !== ticket) return;
     document.documentElement.dataset.loadedMs = Math.round(performance.now());
     this.loaded = true;
     this.thumbnailsDrawn();
-    if (!this.selected) this.restore();
+    this.open();
   }
 
   setCollection({ collection, shapes, n_stored: nStored }) {
@@ -157,7 +159,10 @@ class App {
     this.nStored = nStored ?? shapes.length;
     this.byName = new Map(shapes.map((s) => [s.name, s]));
     this.labels = new Map(collection.labels.map((l) => [l.id, { ...l, rgb: rgb(l.colour) }]));
-    this.showLegend();
+    this.legend.show();
+    this.warnOfUp();
+    $("undo").disabled = !collection.n_undoable;
+    $("undo").title = collection.n_undoable ? "Take back the newest change by a person" : "Nothing to undo: nobody has changed anything";
     this.filter();
     if (shapes.length === 0)
       this.empty("No shapes yet", "Shapes appear here as they are labelled.", `coseg add meshes/ --collection ${collection.name}`);
@@ -176,69 +181,8 @@ class App {
 
   // The gallery.
 
-  showLegend() {
-    const chips = this.labelsInUse().map((label) => {
-      const chip = make("span", { className: "chip", role: "button", tabIndex: 0, "data-label": label.id,
-        "aria-pressed": String(this.only === label.id), title: "Show only shapes with this label" },
-        swatch(label.rgb), make("span", { className: "text" }, this.labelName(label.id)),
-        make("span", { className: "n" }, String(label.n_shapes)));
-      const choose = () => this.choose(label.id);
-      chip.onclick = choose;
-      chip.onkeydown = (event) => event.target === chip && event.key === "Enter" && choose();
-      if (this.edit) {
-        const pencil = make("button", { className: "pencil", title: "Rename", "aria-label": `Rename ${this.labelName(label.id)}` }, "✎");
-        pencil.onclick = (event) => {
-          event.stopPropagation();
-          this.rename(chip, label);
-        };
-        chip.append(pencil);
-      }
-      return chip;
-    });
-    // A name that is being typed stays.
-    if (!$("legend").querySelector("input")) $("legend").replaceChildren(...chips);
-  }
-
-  rename(chip, label) {
-    const input = make("input", { value: label.name ?? "", placeholder: `label ${label.id}`, maxLength: 128, "aria-label": "Name of the label" });
-    const text = chip.querySelector(".text");
-    text.replaceWith(input);
-    input.focus();
-    input.select();
-    let over = false;
-    const end = async (keep) => {
-      if (over) return;
-      over = true;
-      const name = input.value.trim();
-      input.replaceWith(text);
-      if (!keep || !name || name === label.name) return;
-      await this.attempt(async () => {
-        await this.source.change("name", { collection: this.name, label: label.id, name });
-        await this.reload();
-        this.toast(`Label ${label.id} is “${name}” now.`);
-      });
-    };
-    input.onclick = (event) => event.stopPropagation();
-    input.onkeydown = (event) => {
-      event.stopPropagation();
-      if (event.key === "Enter") end(true);
-      if (event.key === "Escape") end(false);
-    };
-    input.onblur = () => end(true);
-  }
-
-  choose(label) {
-    this.only = this.only === label ? undefined : label;
-    this.showLegend();
-    this.filter();
-    this.gallery.redraw();
-    if (this.stage.scenes?.length) {
-      this.stage.colour();
-      this.stage.draw();
-    }
-  }
-
   filter() {
+    this.filtered = writeAddress({ ...this.view, collection: null, shape: null });
     const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
     const names = (s) => `${s.name} ${s.parts.map((p) => this.labelName(p.label)).join(" ")}`.toLowerCase();
     let found = this.shapes.filter((s) => words.every((w) => names(s).includes(w)));
@@ -258,60 +202,132 @@ class App {
     else if (this.shapes.length) this.empty();
   }
 
+  /** Says if shapes seem to stand along another axis than the collection's, and what to do about it. */
+  warnOfUp() {
+    const { about } = this;
+    const other = about.up_disagrees;
+    $("warning").hidden = !other;
+    if (!other) return;
+    const word = /^[\p{L}\p{N}_.][\p{L}\p{N}_.-]*$/u.test(about.name);
+    const name = word ? about.name : `'${about.name.replaceAll("'", "'\\''")}'`;
+    $("warning").replaceChildren(
+      `This collection was given up ${about.up}, but ${percent(other.agreement)} of its shapes stand along ${other.up}. If they do, this finds the labels again: `,
+      make("code", {}, `coseg collections set ${name} --up ${other.up}`));
+  }
+
+  // Where the page is. Everything that is chosen goes through the address, so that Back, Forward and a link do it too.
+
+  /** Goes where the changes lead from here: a new entry of the history, or another address for this one. */
+  go(changes, { replace = false } = {}) {
+    const address = writeAddress({ ...this.view, ...changes });
+    if (address === writeAddress(this.view)) return this.follow();
+    if (replace) history.replaceState(null, "", address);
+    else history.pushState(null, "", address);
+    return this.follow();
+  }
+
+  /** Shows what the address says. */
+  async follow() {
+    const { stage } = this;
+    const view = readAddress(location.hash);
+    const names = this.library.collections.map((c) => c.name);
+    const unknown = view.collection && !names.includes(view.collection) ? view.collection : null;
+    if (!names.includes(view.collection)) Object.assign(view, { collection: names[0], shape: null, label: null });
+    const tab = document.querySelector(`[data-mode="${view.view}"]:not([hidden])`);
+    if (view.shape && !tab) Object.assign(view, { view: "labels", detail: null });
+    const stays = view.collection === this.name && view.shape === this.selected && view.view === stage.mode;
+    if (stage.painted.size && !stays) {
+      if (!confirm("Discard what is painted?")) return history.pushState(null, "", writeAddress(this.view));
+      stage.painted.clear();
+    }
+    this.view = view;
+    history.replaceState(null, "", writeAddress(view));
+    document.title = [view.shape, view.collection, "coseg viewer"].filter(Boolean).join(" – ");
+    if (document.activeElement !== $("search")) $("search").value = view.search;
+    $("order").value = view.order;
+    const only = view.label ?? undefined;
+    const dims = only !== this.only;
+    this.only = only;
+    if (unknown) this.toast(`There is no collection “${unknown}” here.`, true);
+    if (view.collection !== this.name) return this.load(view.collection);
+    if (dims) this.legend.show();
+    const wanted = writeAddress({ ...view, collection: null, shape: null });
+    if (wanted !== this.filtered) this.filter();
+    if (dims) this.recolour();
+    await this.open();
+  }
+
+  /** Draws all shapes again, in other colours. */
+  recolour() {
+    this.gallery.redraw();
+    if (!this.stage.scenes?.length) return;
+    this.stage.colour();
+    this.stage.draw();
+  }
+
   // One shape.
 
-  address() {
-    const parts = location.hash.slice(1).split("/").map(decodeURIComponent);
-    return parts;
-  }
-
-  restore() {
-    const [, shape, mode] = this.address();
-    if (shape && this.portraits.has(shape)) this.open(shape, mode);
-  }
-
-  async open(name, mode) {
-    if (!this.portraits.has(name)) return;
-    if (this.stage.painted.size && name !== this.selected && !confirm("Discard what is painted?")) return;
-    this.selected = name;
-    if (mode && document.querySelector(`[data-mode="${mode}"]:not([hidden])`)) this.stage.mode = mode;
+  /** Shows the shape of the address, once it is loaded; closes the stage if there is none. */
+  async open() {
+    const { stage, view } = this;
+    const { shape } = view;
+    if (!shape) return this.close();
+    if (!this.portraits.has(shape)) {
+      if (this.loaded) {
+        this.toast(`There is no shape “${shape}” in ${this.name}${this.byName.has(shape) ? " that is loaded" : ""}.`, true);
+        await this.go({ shape: null }, { replace: true });
+      }
+      return;
+    }
+    const another = this.selected !== shape;
+    const other = another || stage.mode !== view.view;
+    if (!other && this.detail === view.detail) return;
+    this.selected = shape;
+    this.detail = view.detail;
+    stage.choose(view);
     $("stage").hidden = $("panel").hidden = false;
     $("main").classList.add("open");
-    this.gallery.select(name);
-    this.showMode();
-    this.panel.show(name);
-    await this.stage.show(name);
+    this.gallery.select(shape);
+    this.showTabs();
+    // A narrow page has no room for the cards beside the shape.
+    if (another && document.activeElement?.closest("#gallery") && this.gallery.root.clientHeight === 0) this.tab().focus();
+    if (other) {
+      this.panel.show(shape);
+      // What the view is about is at the top of it.
+      this.panel.root.scrollTop = 0;
+    }
+    if (another) await stage.show(shape);
+    else await stage.refresh();
   }
 
-  showMode() {
-    for (const tab of document.querySelectorAll("[data-mode]"))
-      tab.setAttribute("aria-selected", String(tab.dataset.mode === this.stage.mode));
+  tab() {
+    return document.querySelector(`[data-mode="${this.stage.mode}"]`);
+  }
+
+  showTabs() {
+    for (const tab of document.querySelectorAll("[data-mode]")) {
+      const chosen = tab === this.tab();
+      tab.setAttribute("aria-selected", String(chosen));
+      tab.tabIndex = chosen ? 0 : -1;
+    }
     $("scene").classList.toggle("painting", this.stage.mode === "correct");
-    history.replaceState(null, "", `#${[this.name, this.selected, this.stage.mode].map(encodeURIComponent).join("/")}`);
-  }
-
-  async setMode(mode) {
-    if (this.stage.painted.size && !confirm("Discard what is painted?")) return;
-    this.stage.painted.clear();
-    this.stage.mode = mode;
-    this.showMode();
-    // The functional map is at the top of it.
-    if (mode === "map") this.panel.root.scrollTop = 0;
-    await this.stage.setMode(mode);
   }
 
   close() {
+    const { selected } = this;
+    const inside = document.activeElement?.closest("#stage, #panel");
     this.selected = null;
     this.stage.close();
     $("stage").hidden = $("panel").hidden = true;
     $("main").classList.remove("open");
     this.gallery.select(null);
+    if (inside) this.gallery.cards.get(selected)?.focus();
   }
 
   step(by) {
     const at = this.found.findIndex((s) => s.name === this.selected);
     const next = this.found[(at + by + this.found.length) % this.found.length];
-    if (next) this.open(next.name);
+    if (next) this.go({ shape: next.name, detail: this.stage.mode === "map" ? null : this.view.detail });
   }
 
   async correct() {
@@ -338,6 +354,10 @@ class App {
 
   toast(text, bad = false) {
     const toast = make("div", { className: bad ? "toast bad" : "toast" }, text);
+    // Over the shapes, so that nothing that can be pressed is under it.
+    const box = ($("stage").hidden ? $("main") : document.querySelector(".scene")).getBoundingClientRect();
+    const room = { left: box.left + 14, bottom: window.innerHeight - Math.min(box.bottom, window.innerHeight) + 14 };
+    for (const [side, pixels] of Object.entries(room)) $("toasts").style[side] = `${Math.round(pixels)}px`;
     $("toasts").append(toast);
     setTimeout(() => toast.remove(), bad ? 9_000 : 5_000);
   }
@@ -349,10 +369,10 @@ class App {
       const names = library.collections.map((c) => c.name);
       const mine = library.collections.find((c) => c.name === this.name);
       const busy = [];
-      if (library.n_queued) busy.push(`${library.n_queued} to place`);
+      if (mine?.n_queued) busy.push(`${mine.n_queued} to place`);
       if (mine?.n_stale) busy.push(`${mine.n_stale} to relabel`);
       this.status(busy.join(" · ") || "live", busy.length ? "work" : "");
-      if (!mine && names.length) await this.load(names[0]);
+      if (!mine && names.length) await this.go({ collection: names[0], shape: null });
       else if (mine && this.loaded && this.differs(mine)) await this.reload();
     } catch {
       this.status("the daemon does not answer", "bad");
@@ -367,7 +387,7 @@ class App {
   }
 
   differs(now) {
-    return ["sequence", "n_shapes", "n_stale"].some((key) => now[key] !== this.about[key]);
+    return ["sequence", "n_shapes", "n_stale", "n_undoable"].some((key) => now[key] !== this.about[key]);
   }
 
   /** Takes over what changed, and draws only that anew. */
@@ -383,23 +403,22 @@ class App {
       }
     const { selected } = this;
     if (!selected) return;
-    if (!this.byName.has(selected)) return this.close();
+    if (!this.byName.has(selected)) return this.go({ shape: null }, { replace: true });
     this.panel.show(selected);
-    const shown = this.stage.mode === "labels" || this.stage.mode === "correct";
+    const shown = ["labels", "history", "correct"].includes(this.stage.mode);
     if (changed.includes(selected) && shown && this.stage.painted.size === 0) await this.stage.refresh();
     else this.panel.showControls();
   }
 
   listen() {
-    $("search").oninput = () => this.filter();
-    $("order").onchange = () => this.filter();
-    $("collections").onchange = () => this.attempt(() => this.load($("collections").value));
-    $("close").onclick = () => {
-      this.close();
-      history.replaceState(null, "", "#" + encodeURIComponent(this.name));
-    };
+    $("search").oninput = () => this.go({ search: $("search").value }, { replace: true });
+    $("order").onchange = () => this.go({ order: $("order").value }, { replace: true });
+    $("collections").onchange = () =>
+      this.attempt(() => this.go({ collection: $("collections").value, shape: null, label: null, search: "" }));
+    $("close").onclick = () => this.go({ shape: null });
     $("previous").onclick = () => this.step(-1);
     $("next").onclick = () => this.step(1);
+    $("skip").onclick = () => (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
     $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
     $("undo").onclick = () => this.attempt(async () => {
       if (!confirm("Take the newest change by a person back? This cannot be redone.")) return;
@@ -407,13 +426,26 @@ class App {
       this.toast(`Undone: ${undone.change}. ${undone.n_left} changes before it can be undone.`);
       await this.reload();
     });
-    for (const tab of document.querySelectorAll("[data-mode]")) tab.onclick = () => this.setMode(tab.dataset.mode);
+    const tabs = [...document.querySelectorAll("[data-mode]")];
+    for (const tab of tabs) tab.onclick = () => this.go({ view: tab.dataset.mode, detail: null });
+    document.querySelector("[role=tablist]").onkeydown = (event) => {
+      const shown = tabs.filter((tab) => !tab.hidden);
+      const next = moved(shown.indexOf(event.target), shown.length, 1, event.key);
+      if (next === null) return;
+      event.preventDefault();
+      shown[next].focus();
+      shown[next].click();
+    };
     document.addEventListener("keydown", (event) => {
-      if (!this.selected || /INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
+      const modified = event.ctrlKey || event.altKey || event.metaKey || event.shiftKey;
+      if (!this.selected || modified || event.defaultPrevented) return;
+      if (/INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
       if (event.key === "Escape") $("close").click();
+      if (event.target.closest("#gallery, [role=tablist]")) return;
       if (event.key === "ArrowLeft") this.step(-1);
       if (event.key === "ArrowRight") this.step(1);
     });
+    window.addEventListener("popstate", () => this.attempt(() => this.follow()));
     window.addEventListener("resize", () => this.gallery.redraw());
   }
 }

@@ -103,16 +103,18 @@ class View {
     return out;
   }
 
-  /** Fills the box with a mesh as it is seen now. */
-  fit(mesh) {
+  /** Fills the box with meshes, one in the place of another, as they are seen now. */
+  fit(meshes) {
     [this.zoom, this.pan] = [1, [0, 0]];
-    const seen = this.project(mesh.positions);
     let [left, right, top, bottom] = [Infinity, -Infinity, Infinity, -Infinity];
-    for (let i = 0; i < seen.length; i += 3) {
-      left = Math.min(left, seen[i]);
-      right = Math.max(right, seen[i]);
-      top = Math.min(top, seen[i + 1]);
-      bottom = Math.max(bottom, seen[i + 1]);
+    for (const mesh of meshes) {
+      const seen = this.project(mesh.positions);
+      for (let i = 0; i < seen.length; i += 3) {
+        left = Math.min(left, seen[i]);
+        right = Math.max(right, seen[i]);
+        top = Math.min(top, seen[i + 1]);
+        bottom = Math.max(bottom, seen[i + 1]);
+      }
     }
     const [, , width, height] = this.box;
     this.zoom = Math.min(width / (right - left || 1), height / (bottom - top || 1)) * 0.92;

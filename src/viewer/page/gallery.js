@@ -32,6 +32,21 @@ function make(tag, properties = {}, ...children) {
   return element;
 }
 
+/** Replaces what is in an element; what has the focus there keeps it, or its successor in the same place gets it. */
+function keepingFocus(root, replace) {
+  const all = () => [...root.querySelectorAll("button, select, input, [tabindex]")];
+  const at = all().indexOf(document.activeElement);
+  replace();
+  if (at >= 0 && !root.contains(document.activeElement)) all()[at]?.focus();
+}
+
+/** Where an arrow key, Home or End leads from one of `count` in rows of `columns`; null for other keys. */
+function moved(at, count, columns, key) {
+  const to = { ArrowLeft: at - 1, ArrowRight: at + 1, ArrowUp: at - columns, ArrowDown: at + columns, Home: 0, End: count - 1 }[key];
+  if (to === undefined || at < 0 || (columns === 1 && /Up|Down/.test(key))) return null;
+  return to < 0 || to >= count ? at : to;
+}
+
 const css = ([r, g, b]) => `rgb(${r | 0} ${g | 0} ${b | 0})`;
 const swatch = (colour) => {
   const element = make("span", { className: "swatch" });
@@ -117,7 +132,18 @@ class Gallery {
     this.sight = new IntersectionObserver((entries) => this.seen(entries), near);
     this.root.addEventListener("click", (event) => {
       const card = event.target.closest(".card");
-      if (card) app.open(card.dataset.name);
+      if (card) app.go({ shape: card.dataset.name, detail: null });
+    });
+    this.root.addEventListener("keydown", (event) => {
+      const cards = [...this.root.children];
+      const columns = getComputedStyle(this.root).gridTemplateColumns.split(" ").length;
+      const at = cards.indexOf(event.target);
+      // One column is walked up and down.
+      const key = columns === 1 ? event.key.replace("Up", "Left").replace("Down", "Right") : event.key;
+      const next = moved(at, cards.length, columns, key);
+      if (next === null) return;
+      event.preventDefault();
+      cards[next].focus();
     });
   }
 

@@ -1,5 +1,8 @@
 // What is known of the shape on the stage, and what is chosen for it.
 
+/** Lines of the history beside other things; its own view has all. */
+const MAX_LINES = 60;
+
 class Panel {
   constructor(app) {
     this.app = app;
@@ -16,20 +19,23 @@ class Panel {
     const log = make("ol", { className: "log" });
     this.mapBox = make("div");
     const state = shape.stale ? ", waits to be relabelled" : "";
-    this.root.replaceChildren(
-      make("h2", {}, name),
-      make("div", { className: "facts" },
-        `${shape.n_polygons.toLocaleString("en")} faces · labels version ${shape.version}${state}`),
+    const past = [make("h3", {}, "History"), log];
+    const sections = app.stage.mode === "history" ? past : [
       this.mapBox,
       make("h3", {}, `Parts (${shape.parts.length})`),
       this.parts(shape),
       make("h3", {}, "Most alike"),
       near,
-      make("h3", {}, "History"),
-      log,
+      ...past,
       make("h3", {}, "Mesh"),
       make("div", { className: "facts" }, meshText(shape)),
-    );
+    ];
+    keepingFocus(this.root, () => this.root.replaceChildren(
+      make("h2", {}, name),
+      make("div", { className: "facts" },
+        `${shape.n_polygons.toLocaleString("en")} faces · labels version ${shape.version}${state}`),
+      ...sections,
+    ));
     const [neighbours, events] = await Promise.all([
       app.nearest(name).catch(() => []),
       app.events().catch(() => []),
@@ -57,9 +63,11 @@ class Panel {
       );
       row.title = `part ${i}, mean probability ${part.confidence.toFixed(2)}`;
       const highlight = { part: i, label: part.label, share: part.area_share };
-      row.onmouseenter = () => app.stage.setHighlight(highlight);
-      row.onmouseleave = () => app.stage.setHighlight(pressed?.highlight ?? null);
+      const lit = () => app.stage.setHighlight(highlight);
+      const unlit = () => app.stage.setHighlight(pressed?.highlight ?? null);
+      [row.onmouseenter, row.onfocus, row.onmouseleave, row.onblur] = [lit, lit, unlit, unlit];
       row.onclick = () => {
+        if (app.stage.mode === "correct") return app.stage.paintPart(highlight);
         pressed?.row.setAttribute("aria-pressed", "false");
         pressed = pressed?.row === row ? null : { row, highlight };
         pressed?.row.setAttribute("aria-pressed", "true");
@@ -73,10 +81,10 @@ class Panel {
   neighbours(box, neighbours) {
     if (neighbours.length === 0) box.replaceWith(make("div", { className: "facts" }, "no other shape"));
     for (const [name, distance] of neighbours) {
-      const canvas = make("canvas");
+      const canvas = make("canvas", { "aria-hidden": "true" });
       const button = make("button", { title: `${name}, distance ${distance.toFixed(3)}` }, canvas,
         make("span", {}, name));
-      button.onclick = () => this.app.open(name);
+      button.onclick = () => this.app.go({ shape: name, detail: null });
       box.append(button);
       if (this.app.portraits.has(name)) this.app.thumbnails.ask(canvas, name);
     }
@@ -95,7 +103,7 @@ class Panel {
           swatch(app.colour(m.from)), "→", swatch(app.colour(m.to)), percent(m.area_share)));
       lines.push(make("li", { className: about.person ? "person" : "" }, about.text,
         items.length ? make("div", { className: "moves" }, ...items) : null));
-      if (lines.length === 60) break;
+      if (lines.length === MAX_LINES && app.stage.mode !== "history") break;
     }
     list.replaceChildren(...lines);
     if (lines.length === 0) list.append(make("li", {}, "nothing yet"));
@@ -103,26 +111,26 @@ class Panel {
 
   /** What can be chosen in the mode of the stage. */
   showControls() {
-    const { stage } = this.app;
-    const box = $("controls");
+    keepingFocus($("controls"), () => this.controls($("controls")));
+  }
+
+  controls(box) {
+    const { app } = this;
+    const { stage } = app;
+    const at = (value) => app.go({ detail: String(value + 1) }, { replace: true });
     this.mapBox?.replaceChildren();
     if (stage.mode === "eigen" && stage.functions)
-      box.replaceChildren(...slider("Eigenfunction", stage.eigen, stage.functions.eigenvalues.length, (value) => {
-        stage.eigen = value;
-        stage.refresh();
-      }, `${stage.eigen + 1}, λ = ${stage.functions.eigenvalues[stage.eigen].toPrecision(4)}`),
+      box.replaceChildren(...slider("Eigenfunction", stage.eigen, stage.functions.eigenvalues.length, at, `${stage.eigen + 1}, λ = ${stage.functions.eigenvalues[stage.eigen].toPrecision(4)}`),
       bar(DIVERGING), make("span", { className: "quiet" }, "− to +, lines of equal value"));
     else if (stage.mode === "hks" && stage.functions)
-      box.replaceChildren(...slider("Time", stage.time, stage.functions.times.length, (value) => {
-        stage.time = value;
-        stage.refresh();
-      }, `t = ${stage.functions.times[stage.time].toPrecision(3)}`),
+      box.replaceChildren(...slider("Time", stage.time, stage.functions.times.length, at, `t = ${stage.functions.times[stage.time].toPrecision(3)}`),
       bar(SEQUENTIAL), make("span", { className: "quiet" }, "little to much heat left"));
     else if (stage.mode === "map") this.mapControls(box);
     else if (stage.mode === "correct") this.paintControls(box);
     else
       box.replaceChildren(make("span", { className: "quiet" },
-        "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over"));
+        "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over. " +
+        "With keys: Shift and arrows turn, + and − zoom, 0 starts over, ← and → go to other shapes"));
   }
 
   mapControls(box) {
@@ -130,10 +138,7 @@ class Panel {
     const from = make("select", { "aria-label": "Carried from" },
       ...this.app.mapSources(selected).map((name) => make("option", { value: name }, name)));
     from.value = stage.from ?? "";
-    from.onchange = () => {
-      stage.from = from.value;
-      stage.refresh();
-    };
+    from.onchange = () => this.app.go({ detail: from.value });
     const what = make("select", { "aria-label": "What is carried" },
       make("option", { value: "labels" }, "labels"), make("option", { value: "place" }, "colours of places"));
     what.value = stage.carried;
@@ -148,8 +153,9 @@ class Panel {
 
   heatMap(map) {
     const [rows, columns] = map.c_12.shape;
-    const canvas = make("canvas", { className: "heat", width: columns, height: rows,
-      title: `C, ${rows} × ${columns}: coefficients on ${map.from} to coefficients on ${map.to}` });
+    const canvas = make("canvas", { className: "heat", role: "img", width: columns, height: rows,
+      title: `C, ${rows} × ${columns}: coefficients on ${map.from} to coefficients on ${map.to}`,
+      "aria-label": `The matrix of the functional map, ${rows} by ${columns}` });
     const values = numbers(map.c_12);
     const largest = values.reduce((m, v) => Math.max(m, Math.abs(v)), 1e-9);
     const pixels = new ImageData(columns, rows);
@@ -181,7 +187,7 @@ class Panel {
     brush.label ??= ids[0] ?? fresh;
     const choose = (label) => {
       brush.label = label;
-      this.paintControls(box);
+      this.showControls();
     };
     const entry = (label, text) => {
       const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label },
@@ -215,7 +221,7 @@ class Panel {
     const n = this.app.stage.painted.size;
     if (!this.apply) return;
     this.apply.disabled = this.discard.disabled = n === 0;
-    this.amount.textContent = n ? `${n} faces painted` : "paint on the shape, drag beside it to turn";
+    this.amount.textContent = n ? `${n} faces painted` : "paint on the shape, or press its parts in the list; drag beside it to turn";
   }
 }
 
@@ -268,6 +274,7 @@ function labelEvent(e, app) {
     case "label_merged": return { text: `${name(e.from)} merged into ${name(e.into)}`, person: true };
     case "label_split": return { text: `${name(e.from)} split`, person: true };
     case "undone": return { text: `${e.change} undone`, person: true };
+    case "up_changed": return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
     default: return null;
   }
 }

@@ -35,7 +35,7 @@ class Raster {
     const view = new View();
     const [columns, rows] = [width * SAMPLES, height * SAMPLES];
     view.box = [0, 0, columns, rows];
-    view.fit(mesh);
+    view.fit([mesh]);
     const n = columns * rows;
     if (this.depth.length !== n) [this.depth, this.colours] = [new Float32Array(n), new Uint32Array(n)];
     this.depth.fill(-Infinity);

@@ -2,6 +2,14 @@
 
 /** Triangles up to which the mesh that was sent is shown instead of the proxy. */
 const MAX_SURFACE = 120_000;
+/**
+ * Share of carried labels that are expected to be right below which a map comes with a warning: a face in four is wrong.
+ * The poorest fifth of the maps between shapes of one class is like that, and carries 0.73 of the area rightly; the label
+ * model alone has 0.89 (docs/maps.md).
+ */
+const POOR_MAP = 0.75;
+/** Share of its box that a shape fills. */
+const ROOM = 0.88;
 
 class Stage {
   constructor(app) {
@@ -30,10 +38,17 @@ class Stage {
     await this.refresh();
   }
 
-  async setMode(mode) {
-    this.mode = mode;
-    this.highlight = null;
-    await this.refresh();
+  /** Takes over what an address says of the shape. */
+  choose({ view, detail }) {
+    if (this.mode !== view) {
+      this.highlight = null;
+      this.functions = this.map = null;
+    }
+    this.mode = view;
+    const at = /^\d+$/.test(detail ?? "") ? Math.max(Number(detail) - 1, 0) : null;
+    if (view === "map") this.from = detail;
+    if (view === "eigen") this.eigen = at ?? this.eigen;
+    if (view === "hks") this.time = at ?? this.time;
   }
 
   close() {
@@ -51,6 +66,12 @@ class Stage {
     $("notice").hidden = !text;
   }
 
+  /** Warns of what is shown. */
+  advise(text) {
+    $("advice").textContent = text;
+    $("advice").hidden = !text;
+  }
+
   /** Fetches and shows what belongs to shape and mode; a later call makes an earlier one void. */
   async refresh() {
     const ticket = (this.ticket = (this.ticket ?? 0) + 1);
@@ -61,6 +82,7 @@ class Stage {
       return;
     }
     this.notice("");
+    this.advise("");
     $("loading").hidden = false;
     try {
       const scenes = await this.build(mode, name, portrait, ticket);
@@ -81,7 +103,7 @@ class Stage {
   async build(mode, name, portrait, ticket) {
     const { app } = this;
     const proxy = new Mesh(portrait, app.up);
-    if (mode === "labels" || mode === "correct") {
+    if (mode === "labels" || mode === "history" || mode === "correct") {
       const info = app.shape(name);
       const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
       if (!fine && mode === "correct")
@@ -126,14 +148,22 @@ class Stage {
           ? "A map needs a second shape."
           : "No map to this shape is in this file. Write it with --maps N to have more.",
       );
+    const missing = this.from && !sources.includes(this.from) ? this.from : null;
     if (!sources.includes(this.from)) this.from = sources[0];
     const map = (this.map = await app.map(this.from, name));
+    const right = map.quality?.confidence ?? 1;
+    if (missing) this.advise(`There is no map from “${missing}” here; this one is from “${this.from}”.`);
+    if (right < POOR_MAP)
+      this.advise(
+        `This map is poor: ${percent(right)} of the labels that it carries are expected to be right. ` +
+          "Do not build on it; another shape under “From” may fit better.",
+      );
     const source = new Mesh(app.portraits.get(this.from), app.up);
     const colour = this.carried === "labels" ? labelColours(source, app) : placeColours(source);
     const back = map.p2p_21.data;
     return [
-      { mesh: source, caption: this.from, note: "from", colours: vertexColours(source, colour), plain: true },
-      { mesh: proxy, caption: name, note: "carried to", colours: vertexColours(proxy, (v) => colour(back[v])), plain: true },
+      { mesh: source, caption: this.from, note: "from this shape", colours: vertexColours(source, colour), plain: true },
+      { mesh: proxy, caption: name, note: `carried to this one, ${percent(right)} right as expected`, colours: vertexColours(proxy, (v) => colour(back[v])), plain: true },
     ];
   }
 
@@ -158,17 +188,30 @@ class Stage {
     );
     this.resize();
     if (!this.fitted) this.fit();
+    else if (!this.moved) this.fill();
     this.draw();
   }
 
+  /** Starts over: seen from where every shape is seen first. */
   fit() {
     this.fitted = true;
     const turned = new View();
     Object.assign(this.view, { yaw: turned.yaw, pitch: turned.pitch });
+    this.fill();
+  }
+
+  /** Fills the room there is, as seen from where it is seen now. */
+  fill() {
+    this.moved = false;
     this.view.box = [0, 0, this.canvas.width / this.scenes.length, this.canvas.height];
-    this.view.fit(this.scenes.at(-1).mesh);
-    this.view.zoom *= 0.88;
-    this.view.pan = this.view.pan.map((p) => p * 0.88);
+    this.view.fit(this.scenes.map((scene) => scene.mesh));
+    // Below the captions.
+    const captions = $("captions");
+    const taken = (captions.offsetTop + captions.offsetHeight) / Math.max(this.canvas.clientHeight, 1);
+    const room = Math.max(Math.min(ROOM, 1 - taken), 0.4);
+    this.view.zoom *= room;
+    const [x, y] = this.view.pan;
+    this.view.pan = [x * room, y * room - 2 * Math.max(taken - (1 - room) / 2, 0)];
   }
 
   /** Label of each face as painted so far. */
@@ -275,6 +318,7 @@ class Stage {
       const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
       [drag.x, drag.y] = [event.clientX, event.clientY];
       if (drag.shift) {
+        this.moved = true;
         view.pan[0] += (2 * dx * this.scenes.length) / canvas.clientWidth;
         view.pan[1] -= (2 * dy) / canvas.clientHeight;
       } else {
@@ -297,19 +341,38 @@ class Stage {
     });
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
-      const factor = Math.exp(-event.deltaY * 0.0012);
-      view.zoom = Math.min(Math.max(view.zoom * factor, 0.2), 30);
-      view.pan = view.pan.map((p) => p * factor);
-      this.draw();
+      this.zoom(Math.exp(-event.deltaY * 0.0012));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
-      const step = { a: [-0.15, 0], d: [0.15, 0], w: [0, 0.1], s: [0, -0.1] }[event.key];
+      if (event.ctrlKey || event.altKey || event.metaKey || !this.scenes?.length) return;
+      const zoom = { "+": 1.15, "=": 1.15, "-": 1 / 1.15 }[event.key];
+      if (zoom) return this.zoom(zoom);
+      if (event.key === "0") {
+        this.fit();
+        return this.draw();
+      }
+      const arrow = event.shiftKey && event.key.startsWith("Arrow") ? event.key.slice(5) : event.key;
+      const step = { a: [-0.15, 0], d: [0.15, 0], w: [0, 0.1], s: [0, -0.1],
+        Left: [-0.15, 0], Right: [0.15, 0], Up: [0, 0.1], Down: [0, -0.1] }[arrow];
       if (!step) return;
+      event.preventDefault();
       view.yaw += step[0];
       view.pitch = Math.min(Math.max(view.pitch + step[1], -1.5), 1.5);
       this.draw();
     });
-    new ResizeObserver(() => this.draw()).observe(canvas);
+    new ResizeObserver(() => {
+      this.resize();
+      if (this.scenes?.length && !this.moved) this.fill();
+      this.draw();
+    }).observe(canvas);
+  }
+
+  zoom(factor) {
+    const { view } = this;
+    this.moved = true;
+    view.zoom = Math.min(Math.max(view.zoom * factor, 0.2), 30);
+    view.pan = view.pan.map((p) => p * factor);
+    this.draw();
   }
 
   hover(event) {
@@ -352,6 +415,17 @@ class Stage {
     this.draw();
     this.app.panel.paintedChanged();
     return true;
+  }
+
+  /** Paints a part as the list has it: what the brush does, without a mouse. */
+  paintPart(highlight) {
+    const mesh = this.scenes?.[0]?.mesh;
+    if (!mesh?.polygons || this.brush.label === null) return;
+    const covers = this.highlighted(mesh, highlight);
+    for (let f = 0; f < mesh.nFaces; f++) if (covers(f)) this.painted.set(mesh.polygons[f], this.brush.label);
+    this.colour();
+    this.draw();
+    this.app.panel.paintedChanged();
   }
 
   discard() {

@@ -55,16 +55,22 @@ fn send_each_again_and_again(seed: u64) {
         into: 1,
     });
     let undo = Body::Undo(wire::UndoRequest { collection: c() });
+    let up = |up: wire::Up| {
+        let (collection, up) = (c(), up.into());
+        Body::UpdateCollection(wire::UpdateCollectionRequest { collection, up })
+    };
     let requests = [
         add("a", 0),
         add("b", 1),
         add("x", 2),
+        (up(wire::Up::PlusZ), vec![]),
         (remove, vec![]),
         (split, vec![]),
         (correct, vec![]),
         (name, vec![]),
         (merge, vec![]),
         (undo, vec![]),
+        (up(wire::Up::Auto), vec![]),
     ];
     let connect = |daemon: &Daemon| {
         let mut client = daemon.client();
@@ -88,7 +94,7 @@ fn send_each_again_and_again(seed: u64) {
         wait_idle(&mut client, "c");
         replies.push(first);
         let events = events_since(&mut client, "c");
-        if [2, 4, 7].contains(&i) {
+        if [2, 3, 5, 8].contains(&i) {
             daemon.signal(Signal::KILL);
             drop(daemon.ended());
             daemon = home.start();

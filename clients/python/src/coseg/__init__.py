@@ -63,6 +63,7 @@ from coseg.types import (
     Suggestion,
     Transferred,
     Undone,
+    Updated,
     UpEstimate,
 )
 
@@ -121,6 +122,7 @@ __all__ = [
     "Suggestion",
     "Transferred",
     "Undone",
+    "Updated",
     "UpEstimate",
     "default_endpoint",
 ]

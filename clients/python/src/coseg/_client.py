@@ -255,6 +255,13 @@ class Collection:
         reply, _ = self._call("describe_collection")
         return wire.collection(reply.collection)
 
+    def set(self, *, up: str) -> t.Updated:
+        """Changes which way is up, such as ``"+z"``: labels are found again along the new axis, and faces that
+        were labelled by hand keep theirs. Shapes that are left to do follow in the background:
+        :meth:`wait_idle`. Can be undone."""
+        reply, _ = self._call("update_collection", up=wire.up_value(up))
+        return wire.flat(t.Updated, reply)
+
     def delete(self) -> None:
         """Deletes the collection with its shapes, labels and events."""
         self._call("delete_collection")
@@ -587,7 +594,7 @@ class Collection:
         return found[0]
 
     def undo(self) -> t.Undone:
-        """Takes back the newest correction, name, merge or split."""
+        """Takes back the newest correction, name, merge, split or change of the up axis."""
         reply, _ = self._call("undo")
         return wire.flat(t.Undone, reply)
 

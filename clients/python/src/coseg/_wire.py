@@ -214,6 +214,12 @@ def up_name(value: int) -> str:
     return name.replace("plus_", "+").replace("minus_", "-")
 
 
+def up_value(name: str) -> Any:
+    """The axis of that name."""
+    key = "UP_" + name.upper().replace("+", "PLUS_").replace("-", "MINUS_")
+    return _value(collection_pb2.Up, key, f"up is {name!r}")
+
+
 def changed_label(reply: correction_pb2.MergeLabelsReply | correction_pb2.SplitLabelReply) -> t.ChangedLabel:
     """A label after a merge or a split."""
     return t.ChangedLabel(**vars(label(reply.label)), n_changed=reply.n_shapes)
@@ -222,9 +228,11 @@ def changed_label(reply: correction_pb2.MergeLabelsReply | correction_pb2.SplitL
 def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
     """A collection."""
     spec = message.spec
-    estimate = None
-    if message.HasField("up_estimate"):
-        estimate = t.UpEstimate(up_name(message.up_estimate.up), message.up_estimate.agreement)
+    estimates: dict[str, t.UpEstimate | None] = {}
+    for field in ("up_estimate", "up_disagrees"):
+        found = getattr(message, field)
+        is_there = message.HasField(field)
+        estimates[field] = t.UpEstimate(up_name(found.up), found.agreement) if is_there else None
     return flat(
         t.CollectionInfo,
         message,
@@ -234,7 +242,7 @@ def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
         operator=enum_name(collection_pb2.Operator, "OPERATOR_", spec.operator).replace("_", "-"),
         working_faces=spec.working_faces,
         labels=tuple(map(label, message.labels)),
-        up_estimate=estimate,
+        **estimates,
     )
 
 
@@ -253,8 +261,7 @@ def collection_spec(
             raise ValueError(f"parts is {parts}, but must be 1 to {MAX_PARTS}, or 0: estimated")
         spec.n_parts = parts
     if up is not None:
-        key = "UP_" + up.upper().replace("+", "PLUS_").replace("-", "MINUS_")
-        spec.up = _value(collection_pb2.Up, key, f"up is {up!r}")
+        spec.up = up_value(up)
     if operator is not None:
         key = "OPERATOR_" + operator.upper().replace("-", "_")
         spec.operator = _value(collection_pb2.Operator, key, f"operator is {operator!r}")

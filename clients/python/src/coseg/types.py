@@ -98,6 +98,23 @@ class CollectionInfo:
     labels: tuple[Label, ...]
     #: With ``up="auto"``, once there are shapes.
     up_estimate: UpEstimate | None = None
+    #: Set if the up axis is given and at least half of the shapes stand clearly better along one other axis: that
+    #: one. The given one is probably a mistake, which ``collection.set(up=...)`` corrects.
+    up_disagrees: UpEstimate | None = None
+    #: Changes by a person that ``undo`` can take back.
+    n_undoable: int = 0
+
+
+@dataclass(frozen=True)
+class Updated:
+    """What became of a change of a collection's settings."""
+
+    #: Whether it was another one before; if not, nothing was done.
+    changed: bool
+    #: Shapes whose labels wait to be recomputed.
+    n_stale: int
+    #: Number of the collection's newest event after it.
+    sequence: int
 
 
 @dataclass(frozen=True)
@@ -418,7 +435,7 @@ class Corrected:
 
 @dataclass(frozen=True)
 class Undone:
-    """What was undone: ``"correct"``, ``"name"``, ``"merge"`` or ``"split"``."""
+    """What was undone: ``"correct"``, ``"name"``, ``"merge"``, ``"split"`` or ``"up"``."""
 
     change: str
     #: Changes that can still be undone.
