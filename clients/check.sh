@@ -26,40 +26,70 @@ if git -C "$ROOT" rev-parse --git-dir >/dev/null 2>&1; then
     buf breaking "$ROOT/proto" --against "$WORK/released/proto"
 fi
 
+step "Python: wheel and source archive, in an environment of their own"
+(
+    "$WORK/venv/bin/python" - "$WORK"/wheel/*.whl <<'PY'
+import sys, zipfile
+names = zipfile.ZipFile(sys.argv[1]).namelist()
+wanted = ["coseg/py.typed", "coseg/_client.py", "coseg/v1/__init__.py", "coseg/v1/message_pb2.py", "coseg/v1/message_pb2.pyi"]
+assert not (missing := [n for n in wanted if n not in names]), missing
+assert sum("/licenses/LICENSE-" in n for n in names) == 2, names
+print(sys.argv[1].rsplit("/", 1)[1], len(names), "files")
+PY
+    rm -rf "$WORK/archive" "$WORK/stranger"
+    (cd "$WORK/clean/clients/python" && python -c '
+import sys
+from setuptools.build_meta import build_sdist
+build_sdist(sys.argv[1])' "$WORK/archive" >/dev/null)
+    python3 -m venv "$WORK/stranger"
+    cd "$WORK/stranger"
+    for package in "$WORK"/wheel/*.whl "$WORK"/archive/*.tar.gz; do
+        bin/python -m pip install -q --force-reinstall "$package"
+        bin/python -c 'import coseg, coseg.v1.message_pb2 as m; coseg.Library; print(coseg.__file__, m.Request())'
+    done
+)
+
 step "Python: style, types, tests"
 (
     cd python
     ruff format --check --quiet .
     ruff check --quiet .
-    mypy --no-error-summary
+    # Types of the sources and of the messages beside them.
+    clean="$WORK/clean/clients/python"
+    python -m grpc_tools.protoc -I"$ROOT/proto" --python_out="$clean/src" --pyi_out="$clean/src" "$ROOT"/proto/coseg/v1/*.proto
+    touch "$clean/src/coseg/v1/__init__.py"
+    (cd "$clean" && mypy --no-error-summary)
+    # Against the installed wheel: what is tested is what a stranger gets.
     python -m pytest --durations=3
 )
 
 step "documents: what they say to type, and the Python that is no program of its own"
 python "$ROOT/tests/docs/run.py" "$COSEG_BIN"
 
-step "Python: wheel"
-rm -rf "$WORK/wheel"
-python -m pip wheel -q --no-deps --no-build-isolation -w "$WORK/wheel" ./python
-python - "$WORK"/wheel/*.whl <<'PY'
-import sys, zipfile
-names = zipfile.ZipFile(sys.argv[1]).namelist()
-wanted = ["coseg/py.typed", "coseg/_client.py", "coseg/v1/message_pb2.py", "coseg/v1/message_pb2.pyi"]
-assert not (missing := [n for n in wanted if n not in names]), missing
-print(sys.argv[1].rsplit("/", 1)[1], len(names), "files")
-PY
-
 step "tools for TypeScript"
 node_tools
 
-step "TypeScript: types, tests, tarball"
+step "TypeScript: types, tests"
 (
     cd "$WORK/typescript"
-    npx tsc
     COSEG_GOLDEN="$ROOT/tests/golden" node --test --test-timeout=120000 --test-reporter=dot dist/test/*.test.js
     # The README's program, against a daemon of its own.
     COSEG_ROOT="$ROOT" node dist/test/snippets.js
-    npm pack --silent --ignore-scripts | tail -n 1
+)
+
+step "TypeScript: the tarball in a project of its own"
+(
+    rm -rf "$WORK/project"
+    mkdir "$WORK/project"
+    cd "$WORK/project"
+    npm init -y >/dev/null
+    npm install --silent --no-audit --no-fund "$WORK"/npm/*.tgz
+    ls node_modules/coseg/LICENSE-MIT node_modules/coseg/LICENSE-APACHE
+    node --input-type=module -e '
+        import { Library } from "coseg";
+        import { RequestSchema } from "coseg/v1/message";
+        new Library({ endpoint: "ipc:///nowhere" }).close();
+        console.log(RequestSchema.typeName);'
 )
 
 ./raw/run.sh

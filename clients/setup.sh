@@ -24,7 +24,23 @@ need() {
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
 }
 
-# The Python package with what its tests need, in $WORK/venv.
+# The clients and the protocol as a stranger gets them, in $WORK/clean: nothing that was made in the tree is among them.
+clean_copy() {
+    rm -rf "$WORK/clean"
+    mkdir -p "$WORK/clean"
+    if git -C "$ROOT" rev-parse --git-dir >/dev/null 2>&1; then
+        (
+            cd "$ROOT"
+            # What is not ignored and still there, committed or not.
+            git ls-files -z --cached --others --exclude-standard clients proto |
+                tar -c --null --files-from - --ignore-failed-read 2>/dev/null
+        ) | tar -x -C "$WORK/clean"
+    else
+        cp -r "$ROOT/clients" "$ROOT/proto" "$WORK/clean"
+    fi
+}
+
+# The Python package with what its tests need, in $WORK/venv: the wheel that is built from a clean copy.
 python_tools() {
     if [ ! -x "$WORK/venv/bin/python" ]; then
         need python3 python3 python3-venv
@@ -35,23 +51,27 @@ python_tools() {
         }
         "$WORK/venv/bin/python" -m pip install -q -r "$ROOT/clients/python/requirements-dev.txt"
     fi
-    "$WORK/venv/bin/python" -m pip install -q --no-deps --no-build-isolation -e "$ROOT/clients/python"
+    clean_copy
+    rm -rf "$WORK/wheel"
+    "$WORK/venv/bin/python" -m pip wheel -q --no-deps -w "$WORK/wheel" "$WORK/clean/clients/python"
+    "$WORK/venv/bin/python" -m pip install -q --no-deps --force-reinstall "$WORK"/wheel/*.whl
 }
 
-# Node 20 or newer: Debian's may be older, then the one of the package `node` is taken.
+# Node 20 or newer: Debian's may be older, then the one of the package `node` is taken. The TypeScript package with its
+# tools is then in $WORK/typescript, and packed in $WORK/npm.
 node_tools() {
     need npm nodejs npm
     if ! node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)'; then
         npm install --silent --no-audit --no-fund --prefix "$WORK/node" node@20
         hash -r
     fi
-    # node_modules stays outside the tree.
-    rm -rf "$WORK/typescript"
-    cp -r "$ROOT/clients/typescript" "$WORK/typescript"
-    rm -rf "$WORK/typescript/node_modules" "$WORK/typescript/dist" "$WORK/typescript/src/gen"
+    clean_copy
+    rm -rf "$WORK/typescript" "$WORK/npm"
+    mkdir -p "$WORK/npm"
+    ln -s clean/clients/typescript "$WORK/typescript"
     (
         cd "$WORK/typescript"
         npm ci --silent --no-audit --no-fund
-        COSEG_PROTO="$ROOT/proto" npm run --silent generate
+        npm pack --silent --pack-destination "$WORK/npm" >/dev/null
     )
 }

@@ -10,7 +10,6 @@ from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 HERE = Path(__file__).parent.resolve()
-OUT = HERE / "src"
 
 
 def proto_root() -> Path:
@@ -21,21 +20,26 @@ def proto_root() -> Path:
     raise SystemExit("coseg: the folder proto/coseg/v1 is neither here nor two folders above")
 
 
-def generate() -> None:
-    """Writes coseg/v1/*_pb2.py and their types."""
+def generate(out: Path) -> None:
+    """Writes coseg/v1/*_pb2.py and their types below `out`."""
     root = proto_root()
     files = sorted(str(path) for path in (root / "coseg" / "v1").glob("*.proto"))
     command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{root}"]
-    subprocess.run([*command, f"--python_out={OUT}", f"--pyi_out={OUT}", *files], check=True)
-    (OUT / "coseg" / "v1" / "__init__.py").write_text('"""The messages of the protocol."""\n')
+    out.mkdir(parents=True, exist_ok=True)
+    subprocess.run([*command, f"--python_out={out}", f"--pyi_out={out}", *files], check=True)
+    (out / "coseg" / "v1" / "__init__.py").write_text('"""The messages of the protocol."""\n')
 
 
 class BuildWithMessages(build_py):
-    """Builds after the messages were made."""
+    """Makes the messages where the package is put together.
+
+    They are no part of the source tree: what is looked for there may be looked for before they are made.
+    """
 
     def run(self) -> None:
-        generate()
         super().run()
+        # An editable install is the source tree itself.
+        generate(HERE / "src" if self.editable_mode else Path(self.build_lib))
 
 
 class ArchiveWithProtocol(sdist):

@@ -388,6 +388,16 @@ fault(
     "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
     ("waiting.strong_count() > 0", "waiting.strong_count() > 0 || FAULT"),
 )
+fault(
+    "R11", "r11-memory-unwatched", "let a worker hold whatever it takes",
+    "src/daemon/worker/process.rs", "it daemon::isolation::memory_that_is_held_is_bounded_and_what_is_reserved_is_not",
+    ("            if now > limit {", "            if now > limit && !FAULT {"),
+)
+fault(
+    "R11", "r11-address-space", "take address space that is reserved for memory that is held",
+    "src/daemon/worker/inside.rs", "it daemon::isolation::memory_that_is_held_is_bounded_and_what_is_reserved_is_not",
+    ("in_use + memory + RESERVATIONS", "in_use + memory + if FAULT { 0 } else { RESERVATIONS }"),
+)
 # R12: clocks
 fault(
     "R12", "r12-wall-clock", "believe a clock that jumps",

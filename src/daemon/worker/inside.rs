@@ -23,13 +23,23 @@ use std::process::ExitCode;
 use std::sync::mpsc;
 use std::time::Duration;
 
-/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, stack) in a mesh does as it says
+/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, grow, reserve, stack) in a mesh does as it says
 /// while the shape is described, `poison: abort-placing` (and so on) while it is placed, and `poison: abort-answering`
-/// while a request that names the shape is answered, in the worker. `slow` goes on after some seconds. For tests of the
+/// while a request that names the shape is answered, in the worker. `slow` goes on after some seconds, `reserve` with address
+/// space that it does not use. For tests of the
 /// isolation; no client can set it.
 pub const POISON_VARIABLE: &str = "COSEG_TEST_POISON";
 /// Workers give way to the daemon, which has to answer meanwhile.
 const NICENESS: i32 = 5;
+/// Address space that a worker may reserve beyond the memory that its work may hold, which the daemon watches. Arenas and
+/// stacks of hundreds of threads stay far below it, so that only a request for memory without sense meets this limit.
+const RESERVATIONS: u64 = 64 << 30;
+/// Where the kernel is told how gladly it may end this process when memory runs out, and what: rather than the daemon.
+const OOM_SCORE: (&str, &str) = ("/proc/self/oom_score_adj", "500");
+/// What growing poison takes at most, far beyond what any work may hold: where nobody watches, the machine goes on.
+const GROWN: usize = 6 << 30;
+/// What reserving poison takes: more than a small shape may hold.
+const RESERVED: usize = 8 << 30;
 /// How long slow poison takes.
 const SLOW: Duration = Duration::from_secs(2);
 /// Bytes at the beginning of a mesh that poison is looked for in.
@@ -56,13 +66,20 @@ pub fn run_worker() -> ExitCode {
 fn work() -> io::Result<()> {
     // A worker leaves no core.
     forbid(Resource::Core)?;
+    // Where it is not allowed the kernel chooses by size alone.
+    let _ = std::fs::write(OOM_SCORE.0, OOM_SCORE.1);
+    start_threads(wanted_threads(), |n| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n);
+        let pool = if n == 1 { pool.use_current_thread() } else { pool };
+        pool.build_global().map_err(io::Error::other)
+    })?;
     let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
     let (mut library, mut gives_way) = (None, false);
     let work = read_ahead()?;
     write_frame(READY, &[])?;
     for next in work {
         let (header, bytes) = next?;
-        limit_memory(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
+        limit_reservations(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
         let max_answer = header["answer"].as_u64();
         if max_answer.is_none() && !gives_way {
             gives_way = true;
@@ -87,6 +104,26 @@ fn work() -> io::Result<()> {
         }
     }
     Ok(())
+}
+
+/// The threads that share the work on one shape.
+fn wanted_threads() -> usize {
+    let set = std::env::var("RAYON_NUM_THREADS").ok();
+    set.and_then(|n| n.parse().ok()).unwrap_or(1)
+}
+
+/// Starts so many threads or, where the machine has no more of them, half as many, down to the one that is there. Were they
+/// started when work needs them, the shape would be blamed for the want of them.
+fn start_threads(
+    mut wanted: usize,
+    mut start: impl FnMut(usize) -> io::Result<()>,
+) -> io::Result<()> {
+    loop {
+        match start(wanted.max(1)) {
+            Err(_) if wanted > 1 => wanted /= 2,
+            done => return done,
+        }
+    }
 }
 
 /// Reads in a thread of its own, which ends this process as soon as the input ends, because the daemon has, whatever
@@ -325,8 +362,8 @@ fn forbid(resource: Resource) -> io::Result<()> {
     Ok(setrlimit(resource, none)?)
 }
 
-/// Allows `more` bytes of address space beyond what is in use.
-fn limit_memory(more: u64) -> io::Result<()> {
+/// Lets a request for far more address space than `memory` fail at once, before any of it is used.
+fn limit_reservations(memory: u64) -> io::Result<()> {
     let status = std::fs::read_to_string("/proc/self/status")?;
     let in_use = status
         .lines()
@@ -335,7 +372,7 @@ fn limit_memory(more: u64) -> io::Result<()> {
         .ok_or_else(|| io::Error::other("the kernel does not say how large this process is"))?
         << 10;
     let maximum = getrlimit(Resource::As).maximum;
-    let current = in_use + more;
+    let current = in_use + memory + RESERVATIONS;
     setrlimit(
         Resource::As,
         Rlimit {
@@ -366,11 +403,25 @@ fn take_poison(bytes: &[u8], when: &str) {
             let much = vec![1_u8; 100 << 30];
             std::hint::black_box(&much);
         }
+        "grow" => grow(),
+        "reserve" => {
+            let much: Vec<u8> = Vec::with_capacity(RESERVED);
+            std::mem::forget(std::hint::black_box(much));
+        }
         "slow" => std::thread::sleep(SLOW),
         "stack" => {
             std::hint::black_box(deeper(1));
         }
         _ => {}
+    }
+}
+
+/// Takes memory at no more than a MiB in a millisecond, so that what was held beyond a limit says how long nobody looked.
+fn grow() {
+    let mut taken = Vec::new();
+    while taken.len() < GROWN >> 20 {
+        taken.push(std::hint::black_box(vec![1_u8; 1 << 20]));
+        std::thread::sleep(Duration::from_millis(1));
     }
 }
 
@@ -381,4 +432,29 @@ fn deeper(depth: u64) -> u64 {
         return 0;
     }
     deeper(depth + 1).wrapping_add(here[511])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::start_threads;
+    use std::io;
+
+    #[test]
+    fn a_machine_short_of_threads_gives_fewer() {
+        let tried = |wanted: usize, granted: usize| {
+            let mut tried = Vec::new();
+            let started = start_threads(wanted, |n| {
+                tried.push(n);
+                if n > granted {
+                    return Err(io::ErrorKind::WouldBlock.into());
+                }
+                Ok(())
+            });
+            (tried, started.is_ok())
+        };
+        assert_eq!(tried(8, 8), (vec![8], true));
+        assert_eq!(tried(8, 3), (vec![8, 4, 2], true));
+        assert_eq!(tried(0, 1), (vec![1], true));
+        assert_eq!(tried(3, 0), (vec![3, 1], false));
+    }
 }

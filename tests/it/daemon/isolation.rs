@@ -107,6 +107,37 @@ fn poison_fails_alone_and_can_be_retried() {
     );
 }
 
+/// MiB that growing poison takes in the 200 ms within which it is to be seen, at its fastest.
+const SEEN_WITHIN_MIB: u64 = 200;
+
+#[test]
+fn memory_that_is_held_is_bounded_and_what_is_reserved_is_not() {
+    let home = Home::new();
+    let daemon = home.start_with(&["--workers", "1"], &[(POISON_VARIABLE, "1")]);
+    let client = &mut daemon.client();
+    // It reserves eight times what it may hold, and uses none of it.
+    let job = add(client, "c", &[("reserve", &poisoned("reserve"))]);
+    assert_eq!(job.items[0].state(), ItemState::Done, "{job:?}");
+    assert_eq!(job.items[0].attempts, 0, "no worker ended: {job:?}");
+
+    let job = add(client, "c", &[("grow", &poisoned("grow"))]);
+    let error = job.items[0].error.clone().unwrap();
+    assert_eq!(error.reason(), ErrorReason::ShapeMemory, "{error:?}");
+    assert!(error.message.contains("3 times"), "{error:?}");
+    // "it held 1003 MiB of memory, the limit for a file of this size is 901 MiB"
+    let mib: Vec<u64> = error
+        .message
+        .split(" MiB")
+        .filter_map(|before| before.rsplit(' ').next()?.parse().ok())
+        .collect();
+    let [held, limit] = mib[..] else {
+        panic!("{error:?}")
+    };
+    println!("ended at {held} MiB, the limit is {limit} MiB");
+    assert!((limit..limit + SEEN_WITHIN_MIB).contains(&held), "{error:?}");
+    add(client, "c", &[("good", &skittle(0))]);
+}
+
 #[test]
 fn cancelling_stops_the_work_at_once() {
     let home = Home::new();
