@@ -16,6 +16,7 @@ pub fn check_request(body: &Body, n_frames: usize) -> Result<(), wire::Error> {
     let mut frames = Named::default();
     match body {
         Body::CreateCollection(r) => check_spec(r.spec.as_ref(), "spec")?,
+        Body::UpdateCollection(r) => known::<wire::Up>(r.up, "up")?,
         Body::AddShapes(r) => {
             check_spec(r.create.as_ref(), "create")?;
             known::<wire::AddMode>(r.mode, "mode")?;
