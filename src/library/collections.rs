@@ -10,6 +10,7 @@ use super::{
 use crate::pipeline::Params;
 use crate::store::catalog::KIND_NAME;
 use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader};
+use std::sync::PoisonError;
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -88,6 +89,7 @@ impl Library {
     /// There is none of the name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
+        let known = self.collection_row(name).map(|row| row.id);
         self.once(key, request, |tx| {
             let row = tx.collection(name)?;
             let row = row.ok_or_else(|| LibraryError::NotFound {
@@ -98,6 +100,11 @@ impl Library {
             tx.delete_collection(row.id)?;
             Ok(Vec::new())
         })?;
+        if let Ok(id) = known {
+            // Ids are not used again. Who is at its lane still has it, and finds no collection.
+            let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+            lanes.remove(&id);
+        }
         Ok(())
     }
 

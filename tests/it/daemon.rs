@@ -7,6 +7,7 @@ mod isolation;
 mod life;
 mod overload;
 mod repeats;
+mod resident;
 mod security;
 mod stages;
 mod stopped;
