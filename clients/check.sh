@@ -31,8 +31,8 @@ step "Python: wheel and source archive, in an environment of their own"
     "$WORK/venv/bin/python" - "$WORK"/wheel/*.whl <<'PY'
 import sys, zipfile
 names = zipfile.ZipFile(sys.argv[1]).namelist()
-wanted = ["coseg/py.typed", "coseg/_client.py", "coseg/v1/__init__.py", "coseg/v1/message_pb2.py", "coseg/v1/message_pb2.pyi"]
-assert not (missing := [n for n in wanted if n not in names]), missing
+wanted = ["py.typed", "_client.py", "v1/__init__.py", "v1/message_pb2.py", "v1/message_pb2.pyi"]
+assert not (missing := [n for n in wanted if f"coseg/{n}" not in names]), missing
 assert sum("/licenses/LICENSE-" in n for n in names) == 2, names
 print(sys.argv[1].rsplit("/", 1)[1], len(names), "files")
 PY
@@ -45,7 +45,7 @@ build_sdist(sys.argv[1])' "$WORK/archive" >/dev/null)
     cd "$WORK/stranger"
     for package in "$WORK"/wheel/*.whl "$WORK"/archive/*.tar.gz; do
         bin/python -m pip install -q --force-reinstall "$package"
-        bin/python -c 'import coseg, coseg.v1.message_pb2 as m; coseg.Library; print(coseg.__file__, m.Request())'
+        bin/python -c 'import coseg; from coseg.v1 import message_pb2; print(coseg.__file__)'
     done
 )
 
@@ -56,7 +56,8 @@ step "Python: style, types, tests"
     ruff check --quiet .
     # Types of the sources and of the messages beside them.
     clean="$WORK/clean/clients/python"
-    python -m grpc_tools.protoc -I"$ROOT/proto" --python_out="$clean/src" --pyi_out="$clean/src" "$ROOT"/proto/coseg/v1/*.proto
+    python -m grpc_tools.protoc -I"$ROOT/proto" --python_out="$clean/src" \
+        --pyi_out="$clean/src" "$ROOT"/proto/coseg/v1/*.proto
     touch "$clean/src/coseg/v1/__init__.py"
     (cd "$clean" && mypy --no-error-summary)
     # Against the installed wheel: what is tested is what a stranger gets.

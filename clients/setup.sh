@@ -24,7 +24,8 @@ need() {
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
 }
 
-# The clients and the protocol as a stranger gets them, in $WORK/clean: nothing that was made in the tree is among them.
+# The clients and the protocol as a stranger gets them, in $WORK/clean: nothing that was made in the
+# tree is among them.
 clean_copy() {
     rm -rf "$WORK/clean"
     mkdir -p "$WORK/clean"
@@ -40,7 +41,8 @@ clean_copy() {
     fi
 }
 
-# The Python package with what its tests need, in $WORK/venv: the wheel that is built from a clean copy.
+# The Python package with what its tests need, in $WORK/venv: the wheel that is built from a clean
+# copy.
 python_tools() {
     if [ ! -x "$WORK/venv/bin/python" ]; then
         need python3 python3 python3-venv
@@ -57,8 +59,8 @@ python_tools() {
     "$WORK/venv/bin/python" -m pip install -q --no-deps --force-reinstall "$WORK"/wheel/*.whl
 }
 
-# Node 20 or newer: Debian's may be older, then the one of the package `node` is taken. The TypeScript package with its
-# tools is then in $WORK/typescript, and packed in $WORK/npm.
+# Node 20 or newer: Debian's may be older, then the one of the package `node` is taken. The
+# TypeScript package with its tools is then in $WORK/typescript, and packed in $WORK/npm.
 node_tools() {
     need npm nodejs npm
     if ! node -e 'process.exit(parseInt(process.versions.node) < 20 ? 1 : 0)'; then

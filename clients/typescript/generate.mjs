@@ -11,9 +11,9 @@ const out = join(here, "src/gen");
 
 rmSync(out, { recursive: true, force: true });
 mkdirSync(out, { recursive: true });
-const plugin = { local: join(tools, "protoc-gen-es"), out, opt: ["target=ts", "import_extension=js"] };
-const template = JSON.stringify({ version: "v2", plugins: [plugin] });
-const { error, status } = spawnSync(join(tools, "buf"), ["generate", proto, "--template", template], {
-  stdio: "inherit",
-});
+const opt = ["target=ts", "import_extension=js"];
+const plugins = [{ local: join(tools, "protoc-gen-es"), out, opt }];
+const template = JSON.stringify({ version: "v2", plugins });
+const args = ["generate", proto, "--template", template];
+const { error, status } = spawnSync(join(tools, "buf"), args, { stdio: "inherit" });
 if (error || status !== 0) throw new Error(`buf failed: ${error ?? status}`);

@@ -11,6 +11,7 @@ use super::{
 use crate::pipeline::Params;
 use crate::store::catalog::KIND_NAME;
 use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader, Tx};
+use std::sync::PoisonError;
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -95,7 +96,13 @@ impl Library {
             tx.delete_collection(row.id)?;
             Ok(Vec::new())
         };
+        let known = self.collection_row(name).map(|row| row.id);
         self.store.freeing(|| self.once(key, request, delete))?;
+        if let Ok(id) = known {
+            // Ids are not used again. Who is at its lane still has it, and finds no collection.
+            let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+            lanes.remove(&id);
+        }
         Ok(())
     }
 

@@ -398,6 +398,11 @@ fault(
     "src/daemon/worker/inside.rs", "it daemon::isolation::memory_that_is_held_is_bounded_and_what_is_reserved_is_not",
     ("in_use + memory + RESERVATIONS", "in_use + memory + if FAULT { 0 } else { RESERVATIONS }"),
 )
+fault(
+    "R11", "r11-leak", "keep something of each request for ever",
+    "src/daemon/quota.rs", "it daemon::resident::memory_is_flat_over_operations",
+    ("        mine.requests += 1;\n", "        if FAULT {\n            std::mem::forget(vec![1_u8; 5_000]);\n        }\n        mine.requests += 1;\n"),
+)
 # R12: clocks
 fault(
     "R12", "r12-wall-clock", "believe a clock that jumps",

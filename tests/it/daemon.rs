@@ -10,6 +10,7 @@ mod life;
 mod overload;
 mod refusing;
 mod repeats;
+mod resident;
 mod security;
 mod stages;
 mod stopped;

@@ -97,10 +97,10 @@ fn the_order_of_modules_is_complete() {
 fn links_lead_somewhere() {
     let mut faults = Vec::new();
     let mut documents = files(&root().join("docs"), "md");
-    documents.push((
-        "README.md".into(),
-        fs::read_to_string(root().join("README.md")).unwrap(),
-    ));
+    for name in ["README.md", "CONTRIBUTING.md"] {
+        let text = fs::read_to_string(root().join(name)).unwrap();
+        documents.push((name.into(), text));
+    }
     for (file, text) in documents
         .into_iter()
         .chain(CRATES.iter().flat_map(|s| files(&root().join(s), "rs")))
@@ -121,6 +121,27 @@ fn figures_of_the_readme_are_those_of_the_pages() {
         &readme,
         &String::from_utf8(help.stdout).unwrap(),
     ));
+}
+
+/// A package holds its own folder only, so each has the texts beside it.
+#[test]
+fn every_package_has_the_licence() {
+    for text in ["LICENSE-MIT", "LICENSE-APACHE"] {
+        let ours = fs::read_to_string(root().join(text)).unwrap();
+        for client in ["clients/python", "clients/typescript"] {
+            let beside = root().join(client).join(text);
+            let same = fs::read_to_string(&beside).is_ok_and(|theirs| theirs == ours);
+            assert!(same, "{} differs from {text}", beside.display());
+        }
+    }
+    for file in [
+        "Cargo.toml",
+        "clients/python/pyproject.toml",
+        "clients/typescript/package.json",
+    ] {
+        let text = fs::read_to_string(root().join(file)).unwrap();
+        assert!(text.contains("MIT OR Apache-2.0"), "{file}");
+    }
 }
 
 /// What the README says to type is what the program takes.

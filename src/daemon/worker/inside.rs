@@ -23,21 +23,24 @@ use std::process::ExitCode;
 use std::sync::mpsc;
 use std::time::Duration;
 
-/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, grow, reserve, stack) in a mesh does as it says
-/// while the shape is described, `poison: abort-placing` (and so on) while it is placed, and `poison: abort-answering`
-/// while a request that names the shape is answered, in the worker. `slow` goes on after some seconds, `reserve` with address
-/// space that it does not use. For tests of the
-/// isolation; no client can set it.
+/// If it is set for the daemon, a comment `poison: abort` (or panic, loop, alloc, grow, reserve,
+/// stack) in a mesh does as it says while the shape is described, `poison: abort-placing` (and so
+/// on) while it is placed, and `poison: abort-answering` while a request that names the shape is
+/// answered, in the worker. `slow` goes on after some seconds, `reserve` with address space that it
+/// does not use. For tests of the isolation; no client can set it.
 pub const POISON_VARIABLE: &str = "COSEG_TEST_POISON";
 /// Workers give way to the daemon, which has to answer meanwhile.
 const NICENESS: i32 = 5;
-/// Address space that a worker may reserve beyond the memory that its work may hold, which the daemon watches. Arenas and
-/// stacks of hundreds of threads stay far below it, so that only a request for memory without sense meets this limit.
+/// Address space that a worker may reserve beyond the memory that its work may hold, which the
+/// daemon watches. Arenas and stacks of hundreds of threads stay far below it, so that only a
+/// request for memory without sense meets this limit.
 const RESERVATIONS: u64 = 64 << 30;
-/// Where the kernel is told how gladly it may end this process when memory runs out, and what: rather than the daemon.
+/// Where the kernel is told how gladly it may end this process when memory runs out, and what:
+/// rather than the daemon.
 const OOM_SCORE: (&str, &str) = ("/proc/self/oom_score_adj", "500");
-/// What growing poison takes at most, far beyond what any work may hold: where nobody watches, the machine goes on.
-const GROWN: usize = 6 << 30;
+/// What growing poison takes at most, far beyond what any work may hold: where nobody watches, the
+/// machine goes on.
+const GROWN: usize = 4 << 30;
 /// What reserving poison takes: more than a small shape may hold.
 const RESERVED: usize = 8 << 30;
 /// How long slow poison takes.
@@ -68,11 +71,7 @@ fn work() -> io::Result<()> {
     forbid(Resource::Core)?;
     // Where it is not allowed the kernel chooses by size alone.
     let _ = std::fs::write(OOM_SCORE.0, OOM_SCORE.1);
-    start_threads(wanted_threads(), |n| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n);
-        let pool = if n == 1 { pool.use_current_thread() } else { pool };
-        pool.build_global().map_err(io::Error::other)
-    })?;
+    start_threads().map_err(io::Error::other)?;
     let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
     let (mut library, mut gives_way) = (None, false);
     let work = read_ahead()?;
@@ -106,24 +105,29 @@ fn work() -> io::Result<()> {
     Ok(())
 }
 
-/// The threads that share the work on one shape.
-fn wanted_threads() -> usize {
-    let set = std::env::var("RAYON_NUM_THREADS").ok();
-    set.and_then(|n| n.parse().ok()).unwrap_or(1)
+/// Starts the threads that share the work on one shape. Were they started when the work needs them,
+/// the shape would be blamed for the want of them.
+fn start_threads() -> Result<(), rayon::ThreadPoolBuildError> {
+    let wanted = std::env::var("RAYON_NUM_THREADS").ok();
+    let wanted = wanted.and_then(|n| n.parse().ok()).unwrap_or(1);
+    // Tried beforehand: the pool of the whole process can be started once only.
+    let tried = |n| rayon::ThreadPoolBuilder::new().num_threads(n).build();
+    let n = affordable(wanted, |n| tried(n).is_ok());
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(n);
+    let pool = match n {
+        1 => pool.use_current_thread(),
+        _ => pool,
+    };
+    pool.build_global()
 }
 
-/// Starts so many threads or, where the machine has no more of them, half as many, down to the one that is there. Were they
-/// started when work needs them, the shape would be blamed for the want of them.
-fn start_threads(
-    mut wanted: usize,
-    mut start: impl FnMut(usize) -> io::Result<()>,
-) -> io::Result<()> {
-    loop {
-        match start(wanted.max(1)) {
-            Err(_) if wanted > 1 => wanted /= 2,
-            done => return done,
-        }
+/// So many threads or, where the machine has no more of them, half as many, down to the one that
+/// is there.
+fn affordable(mut wanted: usize, mut can_start: impl FnMut(usize) -> bool) -> usize {
+    while wanted > 1 && !can_start(wanted) {
+        wanted /= 2;
     }
+    wanted.max(1)
 }
 
 /// Reads in a thread of its own, which ends this process as soon as the input ends, because the daemon has, whatever
@@ -416,7 +420,8 @@ fn take_poison(bytes: &[u8], when: &str) {
     }
 }
 
-/// Takes memory at no more than a MiB in a millisecond, so that what was held beyond a limit says how long nobody looked.
+/// Takes memory at no more than a MiB in a millisecond, so that what was held beyond a limit says
+/// how long nobody looked.
 fn grow() {
     let mut taken = Vec::new();
     while taken.len() < GROWN >> 20 {
@@ -436,25 +441,19 @@ fn deeper(depth: u64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use super::start_threads;
-    use std::io;
+    use super::affordable;
 
     #[test]
     fn a_machine_short_of_threads_gives_fewer() {
-        let tried = |wanted: usize, granted: usize| {
-            let mut tried = Vec::new();
-            let started = start_threads(wanted, |n| {
-                tried.push(n);
-                if n > granted {
-                    return Err(io::ErrorKind::WouldBlock.into());
-                }
-                Ok(())
-            });
-            (tried, started.is_ok())
-        };
-        assert_eq!(tried(8, 8), (vec![8], true));
-        assert_eq!(tried(8, 3), (vec![8, 4, 2], true));
-        assert_eq!(tried(0, 1), (vec![1], true));
-        assert_eq!(tried(3, 0), (vec![3, 1], false));
+        for (wanted, granted, expected) in [
+            (8, 8, 8),
+            (8, 3, 2),
+            (8, 0, 1),
+            (3, 2, 1),
+            (1, 0, 1),
+            (0, 0, 1),
+        ] {
+            assert_eq!(affordable(wanted, |n| n <= granted), expected, "{wanted}");
+        }
     }
 }

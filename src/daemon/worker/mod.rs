@@ -1,10 +1,11 @@
 //! Shapes are described and placed, and requests that compute are answered, in processes of their own, so that no shape
 //! can take the daemon down.
 //!
-//! A worker is the same program again (`coseg worker`): it reads what is to be done from stdin, does it ([`inside`]),
-//! and writes stages and the outcome to stdout, one piece of work after the other. A panic is caught in it and is
-//! that shape's failure, or that request's. What ends the process (an abort, a stack overflow, more memory than it may hold) or holds it
-//! beyond the time allowed costs one process; the next shape gets a new one.
+//! A worker is the same program again (`coseg worker`): it reads what is to be done from stdin,
+//! does it ([`inside`]), and writes stages and the outcome to stdout, one piece of work after the
+//! other. A panic is caught in it and is that shape's failure, or that request's. What ends the
+//! process (an abort, a stack overflow, more memory than it may hold) or holds it beyond the time
+//! allowed costs one process; the next shape gets a new one.
 //!
 //! Workers that describe see bytes only. Those that place or answer open the library beside the daemon, which keeps its
 //! own hands off a collection while one of them changes it; a worker that is killed in the middle of a commit leaves what
@@ -33,17 +34,17 @@ use std::time::{Duration, Instant};
 pub const WORKER_COMMAND: &str = "worker";
 /// How long the first worker may take to start.
 const FIRST_START: Duration = Duration::from_secs(30);
-/// How long starting a worker is tried, when the machine has no process, thread or memory left for it; and the delay before it is
-/// tried again, doubled each time.
+/// How long starting a worker is tried, when the machine has no process, thread or memory left for
+/// it; and the delay before it is tried again, doubled each time.
 const START_PATIENCE: Duration = Duration::from_secs(60);
 const START_AGAIN: Duration = Duration::from_millis(100);
 /// A worker that has described a larger file is not used again: its memory is given back.
 const LARGE_FILE: usize = 8 << 20;
-/// Memory that a worker may hold beyond what the work is estimated to take: what the allocator keeps, and meshes whose
-/// spectrum has thousands of equal eigenvalues.
+/// Memory that a worker may hold beyond what the work is estimated to take: what the allocator
+/// keeps, and meshes whose spectrum has thousands of equal eigenvalues.
 const MEMORY_MARGIN: u64 = 768 << 20;
-/// Memory for placing, beside what reading the mesh file again takes: the arrays of forty representatives
-/// and what discovery keeps of them.
+/// Memory for placing, beside what reading the mesh file again takes: the arrays of forty
+/// representatives and what discovery keeps of them.
 const PLACE_MEMORY: u64 = 2 << 30;
 /// Threads of all workers together, for each processor.
 const THREADS_PER_PROCESSOR: usize = 2;
@@ -107,8 +108,9 @@ impl Pool {
         locked(&self.answering).clear();
     }
 
-    /// Runs work that may hold so many bytes of `memory`, in the process that was kept or in another. A process that ends while
-    /// it has nothing to do, or cannot be started, is not the fault of the work, and another is tried.
+    /// Runs work that may hold so many bytes of `memory`, in the process that was kept or in
+    /// another. A process that ends while it has nothing to do, or cannot be started, is not the
+    /// fault of the work, and another is tried.
     fn run(
         &self,
         kept: Option<Process>,

@@ -1,8 +1,10 @@
-//! A worker as the daemon sees it: a process that takes work, and is ended when it holds more memory than the work may.
+//! A worker as the daemon sees it: a process that takes work, and is ended when it holds more
+//! memory than the work may.
 //!
-//! What is bounded is the memory that a worker *holds*, not the address space that it reserves: an allocator with arenas for
-//! many threads, and their stacks, reserve many times what they use. The daemon looks at it several times a second,
-//! from outside, where nothing that the work does can stop the look.
+//! What is bounded is the memory that a worker *holds*, not the address space that it reserves: an
+//! allocator with arenas for many threads, and their stacks, reserve many times what they use. The
+//! daemon looks at it several times a second, from outside, where nothing that the work does can
+//! stop the look.
 
 use super::{OUTCOME, READY, STAGE, WORKER_COMMAND, read_frame};
 use serde_json::Value;
@@ -14,8 +16,9 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// Between looks at whether the work is still wanted and what its process holds. A process takes at most about 5 GB
-/// from the kernel in a second, so it is ended before it holds 250 MB beyond what it may.
+/// Between looks at whether the work is still wanted and what its process holds. A process takes at
+/// most about 5 GB from the kernel in a second, so it is ended before it holds 250 MB beyond what
+/// it may.
 const LOOK: Duration = Duration::from_millis(50);
 /// Lines of stderr that are kept to say why a worker ended.
 const KEPT_LINES: usize = 4;
@@ -129,8 +132,8 @@ impl Process {
         matches!(self.child.try_wait(), Ok(None)).then_some(self)
     }
 
-    /// Sends work that may hold so many bytes of `memory` beyond what is held before, and gives the outcome back together
-    /// with the process, which can take more.
+    /// Sends work that may hold so many bytes of `memory` beyond what is held before, and gives the
+    /// outcome back together with the process, which can take more.
     pub(super) fn run(
         mut self,
         header: &Value,
@@ -140,11 +143,12 @@ impl Process {
         wanted: &dyn Fn() -> bool,
     ) -> Result<(Vec<u8>, Self), Fallen> {
         let Some(before) = held(self.child.id()) else {
-            return Err(self.fallen());
+            return Err(Fallen::BeforeWork(self.death().0));
         };
         let limit = before + memory;
         if self.send(header, bytes).is_err() {
-            return Err(self.fallen());
+            // It cannot have begun with what it has not got.
+            return Err(Fallen::BeforeWork(self.death().0));
         }
         loop {
             match self.frames.recv_timeout(LOOK) {
@@ -230,13 +234,16 @@ impl Drop for Process {
 fn outgrown(held: u64, limit: u64) -> Ended {
     let (held, limit) = (held >> 20, limit >> 20);
     Ended::Died {
-        text: format!("it held {held} MiB of memory, the limit for a file of this size is {limit} MiB"),
+        text: format!(
+            "it held {held} MiB of memory, the limit for a file of this size is {limit} MiB"
+        ),
         out_of_memory: true,
     }
 }
 
-/// Bytes of memory that a process holds and that nobody else can have meanwhile, swapped out or not. Pages of mapped files
-/// are not among them: the kernel takes those back when it needs them. `None`: it has ended.
+/// Bytes of memory that a process holds and that nobody else can have meanwhile, swapped out or
+/// not. Pages of mapped files are not among them: the kernel takes those back when it needs them.
+/// `None`: it has ended.
 fn held(pid: u32) -> Option<u64> {
     held_of(&std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?)
 }
@@ -277,7 +284,8 @@ mod tests {
         child.wait().unwrap();
         assert_eq!(held(pid), None);
         assert_eq!(held_of("Name:\tcoseg\nState:\tZ (zombie)\n"), None);
-        let status = "VmSwap:\t      3 kB\nRssAnon:\t    1024 kB\nRssFile:\t  99999 kB\nRssShmem:\t       1 kB\n";
+        let status =
+            "VmSwap:\t  3 kB\nRssAnon:\t  1024 kB\nRssFile:\t  99999 kB\nRssShmem:\t  1 kB\n";
         assert_eq!(held_of(status), Some(1028 << 10));
     }
 }

@@ -134,7 +134,10 @@ fn memory_that_is_held_is_bounded_and_what_is_reserved_is_not() {
         panic!("{error:?}")
     };
     println!("ended at {held} MiB, the limit is {limit} MiB");
-    assert!((limit..limit + SEEN_WITHIN_MIB).contains(&held), "{error:?}");
+    assert!(
+        (limit..limit + SEEN_WITHIN_MIB).contains(&held),
+        "{error:?}"
+    );
     add(client, "c", &[("good", &skittle(0))]);
 }
 
