@@ -71,10 +71,10 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Array, String> {
 fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, String> {
     let unknown = || format!("elements of kind {kind:?}, but integers, <f4 and <f8 are read");
     let (&order, what) = kind.as_bytes().split_first().ok_or_else(unknown)?;
-    let (b"i" | b"u" | b"b" | b"f", [size @ (b'1' | b'2' | b'4' | b'8')]) =
-        what.split_at(1.min(what.len()))
-    else {
-        return Err(unknown());
+    let (class, size) = match what {
+        [class @ (b'i' | b'u'), size @ (b'1' | b'2' | b'4' | b'8')] => (class, size),
+        [class @ b'b', size @ b'1'] | [class @ b'f', size @ (b'4' | b'8')] => (class, size),
+        _ => return Err(unknown()),
     };
     let size = usize::from(size - b'0');
     if count.and_then(|n| n.checked_mul(size)) != Some(data.len()) {
@@ -91,7 +91,7 @@ fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, S
     };
     let elements = data.chunks_exact(size);
     let zero = |_| 0;
-    match (what[0], size) {
+    match (class, size) {
         (b'i', _) => {
             let sign = |top: u8| if top >= 0x80 { 0xff } else { 0 };
             let values = elements.map(|e| i64::from_le_bytes(word(e, sign)));
@@ -111,11 +111,10 @@ fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, S
             let values = elements.map(|e| f64::from(f32::from_bits(bits(e))));
             Ok(Elements::Floats(values.collect()))
         }
-        (_, 8) => {
+        _ => {
             let values = elements.map(|e| f64::from_le_bytes(word(e, zero)));
             Ok(Elements::Floats(values.collect()))
         }
-        _ => Err(unknown()),
     }
 }
 

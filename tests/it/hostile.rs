@@ -228,16 +228,22 @@ pub(crate) fn corpus() -> Vec<Hostile> {
         let a = i as f64 * 6.283_185e-4;
         [radius * a.cos(), radius * a.sin()]
     };
-    let all = 0..10_000;
+    let corners = 0..10_000;
     let star = |i| circle(i, if i % 2 == 0 { 1.0 } else { 0.1 });
-    flat("a star", &all.clone().map(star).collect::<Vec<_>>());
+    flat("a star", &corners.clone().map(star).collect::<Vec<_>>());
     let knot = |i| circle(i * 7919 % 10_000, 1.0);
-    flat("a knot", &all.clone().map(knot).collect::<Vec<_>>());
+    flat("a knot", &corners.clone().map(knot).collect::<Vec<_>>());
+    // Teeth of all lengths cross nearly all edges of the triangulation: the square of their number.
     let comb = |i: usize| [i as f64, if i % 2 == 0 { 0.0 } else { 1.0 + i as f64 }];
-    flat("a comb", &all.clone().map(comb).collect::<Vec<_>>());
+    flat(
+        "a comb",
+        &corners.clone().take(2_000).map(comb).collect::<Vec<_>>(),
+    );
     flat(
         "a zigzag",
-        &all.map(|i| [(i % 2) as f64, i as f64]).collect::<Vec<_>>(),
+        &corners
+            .map(|i| [(i % 2) as f64, i as f64])
+            .collect::<Vec<_>>(),
     );
     flat(
         "a bow-tie",

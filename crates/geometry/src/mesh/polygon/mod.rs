@@ -10,7 +10,7 @@
 
 use super::{cross, dot, norm, sub};
 use spade::handles::FixedVertexHandle;
-use spade::{ConstrainedDelaunayTriangulation, Point2, Triangulation};
+use spade::{ConstrainedDelaunayTriangulation, HasPosition, Point2, Triangulation};
 use std::collections::HashMap;
 use std::f64::consts::TAU;
 
@@ -25,7 +25,7 @@ const FOLD: f64 = 1e-6;
 /// A corner farther than this from an edge, in units of the polygon's size, does not lie on it.
 const ASIDE: f64 = 1e-6;
 
-type Plane = ConstrainedDelaunayTriangulation<Point2<f64>>;
+type Plane = ConstrainedDelaunayTriangulation<Point>;
 
 /// What a polygon turned out to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -207,9 +207,8 @@ fn other_diagonal(flat: &[[f64; 2]]) -> Option<Vec<[usize; 3]>> {
 
 /// The triangles of a polygon that does not cross itself, as positions in it.
 fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
-    let (plane, ring, corner_of) = points(flat, local)?;
-    let place = |point: usize| local[corner_of[point]];
-    let (plane, passes) = edges(plane, &ring, place)?;
+    let (plane, ring) = points(flat, local)?;
+    let (plane, passes) = edges(plane, &ring, local)?;
     let passes_of = |from: usize, to: usize| passes.get(&(from, to)).copied().unwrap_or(0);
     // The winding number of each face, from the outside inwards.
     let mut winding: Vec<Option<i32>> = vec![None; plane.num_all_faces()];
@@ -234,45 +233,63 @@ fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
         .inner_faces()
         .filter(|face| winding[face.index()] == Some(1));
     let triangles: Vec<[usize; 3]> = inside
-        .map(|face| face.vertices().map(|v| corner_of[v.index()]))
+        .map(|face| face.vertices().map(|v| v.data().corner))
         .collect();
     (!triangles.is_empty()).then_some(triangles)
 }
 
-/// The corners in the plane, the point of each, and for each point the first corner there. `None`
-/// if corners at different positions fall on one point, which is the case for a polygon that stands
-/// on its own plane.
-fn points(
-    flat: &[[f64; 2]],
-    local: &[[f64; 3]],
-) -> Option<(Plane, Vec<FixedVertexHandle>, Vec<usize>)> {
-    let n = flat.len();
-    let mut plane = Plane::with_capacity(n, 3 * n, 2 * n);
-    let mut ring: Vec<FixedVertexHandle> = Vec::with_capacity(n);
-    let mut corner_of: Vec<usize> = Vec::with_capacity(n);
-    for (corner, p) in flat.iter().enumerate() {
-        // Below this a coordinate has no digits left in predicates; the unit is the size of the
-        // polygon.
-        let [x, y] = p.map(|x| {
-            if x.abs() < spade::MIN_ALLOWED_VALUE {
-                0.0
-            } else {
-                x
-            }
-        });
-        let point = Point2::new(x, y);
-        let handle = match ring.last() {
-            Some(&near) => plane.insert_with_hint(point, near).ok()?,
-            None => plane.insert(point).ok()?,
-        };
-        match corner_of.get(handle.index()) {
-            Some(&first) if local[first] != local[corner] => return None,
-            Some(_) => {}
-            None => corner_of.push(corner),
-        }
-        ring.push(handle);
+/// Corners at one position in the plane.
+struct Point {
+    position: Point2<f64>,
+    /// The first of them.
+    corner: usize,
+}
+
+impl HasPosition for Point {
+    type Scalar = f64;
+
+    fn position(&self) -> Point2<f64> {
+        self.position
     }
-    Some((plane, ring, corner_of))
+}
+
+/// The points of a polygon in the plane, and the point of each corner. `None` if corners at different
+/// positions fall on one point, which is the case for a polygon that stands on its own plane.
+fn points(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<(Plane, Vec<FixedVertexHandle>)> {
+    // Below this a coordinate has no digits left in predicates; the unit is the size of the polygon.
+    let kept = |x: f64| match x.abs() < spade::MIN_ALLOWED_VALUE {
+        true => 0.0,
+        false => x,
+    };
+    let place = |corner: usize| flat[corner].map(kept);
+    let order = |&a: &usize, &b: &usize| {
+        let ([ax, ay], [bx, by]) = (place(a), place(b));
+        ax.total_cmp(&bx).then(ay.total_cmp(&by)).then(a.cmp(&b))
+    };
+    let mut sorted: Vec<usize> = (0..flat.len()).collect();
+    sorted.sort_unstable_by(order);
+    let mut first_of = vec![0; flat.len()];
+    let mut all = Vec::with_capacity(flat.len());
+    for same in sorted.chunk_by(|&a, &b| place(a) == place(b)) {
+        let corner = same[0];
+        for &other in same {
+            if local[other] != local[corner] {
+                return None;
+            }
+            first_of[other] = corner;
+        }
+        let [x, y] = place(corner);
+        let position = Point2::new(x, y);
+        all.push(Point { position, corner });
+    }
+    // All at once: one after the other they may take the square of their number.
+    let plane = Plane::bulk_load(all).ok()?;
+    let mut at = vec![None; flat.len()];
+    for vertex in plane.vertices() {
+        at[vertex.data().corner] = Some(vertex.fix());
+    }
+    let ring: Option<Vec<FixedVertexHandle>> = first_of.into_iter().map(|c| at[c]).collect();
+    Some((plane, ring?))
 }
 
 /// How often the polygon passes along each pair of points; edges that other corners lie on are
@@ -285,7 +302,7 @@ type Passes = HashMap<(usize, usize), i32>;
 fn edges(
     mut plane: Plane,
     ring: &[FixedVertexHandle],
-    place: impl Fn(usize) -> [f64; 3],
+    local: &[[f64; 3]],
 ) -> Option<(Plane, Passes)> {
     let mut passes = Passes::with_capacity(ring.len());
     for (i, &from) in ring.iter().enumerate() {
@@ -297,12 +314,13 @@ fn edges(
         if pieces.is_empty() {
             return None;
         }
-        let (begin, end) = (place(from.index()), place(to.index()));
-        let along = sub(end, begin);
+        let place = |vertex: FixedVertexHandle| local[plane.vertex(vertex).data().corner];
+        let begin = place(from);
+        let along = sub(place(to), begin);
         for piece in pieces {
             let edge = plane.directed_edge(piece);
             let pair = (edge.from().index(), edge.to().index());
-            let aside = norm(cross(sub(place(pair.1), begin), along));
+            let aside = norm(cross(sub(place(edge.to().fix()), begin), along));
             if aside > ASIDE * norm(along) {
                 return None;
             }
