@@ -203,10 +203,10 @@ impl State {
         let Some(unsent) = self.clients.get(client) else {
             return Room::Free;
         };
-        if unsent.ending || unsent.progress.elapsed() >= PATIENCE {
-            Room::Hopeless
-        } else if unsent.bytes < self.limit / SHARE && !self.is_short() {
+        if !unsent.ending && unsent.bytes < self.limit / SHARE && !self.is_short() {
             Room::Free
+        } else if unsent.ending || unsent.progress.elapsed() >= PATIENCE {
+            Room::Hopeless
         } else {
             Room::Wait
         }

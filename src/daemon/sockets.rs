@@ -288,6 +288,8 @@ impl SocketThread {
                 self.bound.router.as_poll_item(zmq::POLLIN),
                 self.bound.wake.as_poll_item(zmq::POLLIN),
                 self.bound.zap.as_poll_item(zmq::POLLIN),
+                // It has nothing to read, but takes in subscriptions only when it is asked.
+                self.bound.publisher.as_poll_item(zmq::POLLIN),
             ];
             match zmq::poll(&mut items, POLL_MS) {
                 Ok(_) | Err(zmq::Error::EINTR) => {}

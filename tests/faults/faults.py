@@ -352,6 +352,29 @@ fault(
     "src/daemon/sockets.rs", "it daemon::security::topics_and_frames_beyond_the_limits_end_their_connection_only",
     ("    publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;", "    publisher.set_maxmsgsize(if FAULT { -1 } else { MAX_SUBSCRIPTION_BYTES })?;"),
 )
+FLOOD = "it daemon::flood::memory_is_bounded_whatever_clients_do_not_do"
+fault(
+    "R13", "r13-unread-replies", "make replies for whoever reads none",
+    "src/daemon/replies.rs", FLOOD,
+    ("        if !fits && has + bytes > ALWAYS {", "        if !FAULT && !fits && has + bytes > ALWAYS {"),
+    ("            return Room::Free;\n        };\n", "            return Room::Free;\n        };\n        if FAULT {\n            return Room::Free;\n        }\n"),
+)
+fault(
+    "R13", "r13-unfinished-messages", "take any number of bytes of unfinished messages",
+    "src/daemon/sockets.rs", FLOOD,
+    ("            max_held: i64", "            max_held: if FAULT { i64::MAX } else { 0 } | i64"),
+)
+fault(
+    "R13", "r13-subscriptions", "take any number of subscriptions",
+    "src/daemon/sockets.rs", FLOOD,
+    ("        max_subscriptions: MAX_SUBSCRIPTIONS,", "        max_subscriptions: if FAULT { 0 } else { MAX_SUBSCRIPTIONS },"),
+)
+fault(
+    "R13", "r13-all-files", "leave no files beside those of connections",
+    "src/daemon/sockets.rs", "it daemon::flood::ten_thousand_connections_leave_a_good_client_served",
+    ("    i32::try_from(files - KEPT", "    i32::try_from(if FAULT { files } else { 0 }.max(files - KEPT"),
+    ("KEPT_FILES.min(files / 2)).unwrap_or(i32::MAX)", "KEPT_FILES.min(files / 2))).unwrap_or(i32::MAX)"),
+)
 # R14: the unit
 fault(
     "R14", "r14-misspelt", "misspell a setting of the unit",
