@@ -26,6 +26,8 @@ const DESCRIBE_BASE: u64 = 64 << 20;
 const DESCRIBE_PER_BYTE: u64 = 12;
 /// Bytes that frames of a message take beside what is in them.
 const ARRIVING_BASE: u64 = 8 << 20;
+/// Bytes that a connection takes, whatever comes over it: 24 kB were measured.
+const CONNECTION: u64 = 32 << 10;
 /// Memory below which no shape could be described.
 const MIN_MEMORY: u64 = 256 << 20;
 
@@ -393,6 +395,11 @@ impl Limits {
     /// Bytes set aside for replies that are not sent yet: at least one of the largest.
     pub fn reply_bytes(&self) -> u64 {
         (self.memory.0 / 8).max(self.max_message.0)
+    }
+
+    /// Connections at a time for which there is memory, beside messages.
+    pub fn connections(&self) -> u64 {
+        self.memory.0 / 8 / CONNECTION
     }
 
     /// Bytes set aside for shapes being described.

@@ -43,7 +43,10 @@ pub(crate) struct Outbox {
 
 impl Outbox {
     /// With where the socket thread finds what is left here.
-    pub(crate) fn new(wake: zmq::Socket, replies: Arc<Replies>) -> (Arc<Self>, mpsc::Receiver<Outgoing>) {
+    pub(crate) fn new(
+        wake: zmq::Socket,
+        replies: Arc<Replies>,
+    ) -> (Arc<Self>, mpsc::Receiver<Outgoing>) {
         let (sender, queue) = mpsc::channel();
         let outbox = Self {
             queue: sender,
@@ -119,7 +122,10 @@ impl Dropped {
     pub(crate) fn say(&mut self) {
         let all = self.unread + self.excess + self.subscriptions;
         let recently = |at: Instant| at.elapsed() < SAY_DROPPED;
-        if self.said.map_or(all == 0, |(at, n)| n == all || recently(at)) {
+        if self
+            .said
+            .map_or(all == 0, |(at, n)| n == all || recently(at))
+        {
             return;
         }
         self.said = Some((Instant::now(), all));
@@ -134,7 +140,11 @@ impl Dropped {
 }
 
 /// Sends the frames of a reply, without copying them.
-pub(crate) fn send_reply(router: &mut zmq::Socket, peer: &Peer, frames: Vec<Frame>) -> zmq::Result<()> {
+pub(crate) fn send_reply(
+    router: &mut zmq::Socket,
+    peer: &Peer,
+    frames: Vec<Frame>,
+) -> zmq::Result<()> {
     router.send(&peer.identity[..], zmq::DONTWAIT | zmq::SNDMORE)?;
     if peer.delimiter {
         router.send(zmq::Message::new(), zmq::DONTWAIT | zmq::SNDMORE)?;
@@ -146,4 +156,3 @@ pub(crate) fn send_reply(router: &mut zmq::Socket, peer: &Peer, frames: Vec<Fram
     }
     Ok(())
 }
-

@@ -46,6 +46,14 @@ struct Unsent {
     /// When a frame was last sent, or the first one made.
     progress: Instant,
     ending: bool,
+    /// Requests that wait for room. Until they know that the connection ends, this is kept.
+    waiting: usize,
+}
+
+/// A request that waits for room.
+struct Waiting<'a> {
+    replies: &'a Replies,
+    client: &'a Bytes,
 }
 
 /// A frame that is to be sent. It counts until ZeroMQ lets go of it.
@@ -120,6 +128,7 @@ impl Replies {
         end: impl Fn(Bytes),
     ) -> Result<(), wire::Error> {
         let begin = Instant::now();
+        let _waiting = self.wait(client);
         loop {
             let freed = self.freed.notified();
             match self.state().room(client) {
@@ -161,11 +170,21 @@ impl Replies {
                 state.ending -= bytes;
             }
             if left == 0 {
-                state.clients.remove(client);
+                state.forget(client);
             }
         }
         drop(state);
         self.freed.notify_waiters();
+    }
+
+    fn wait<'a>(&'a self, client: &'a Bytes) -> Waiting<'a> {
+        if let Some(unsent) = self.state().clients.get_mut(client) {
+            unsent.waiting += 1;
+        }
+        Waiting {
+            replies: self,
+            client,
+        }
     }
 }
 
@@ -187,11 +206,18 @@ impl State {
             return false;
         }
         self.used += bytes;
-        let unsent = self.clients.entry(client.clone()).or_insert_with(|| Unsent {
-            bytes: 0,
-            progress: Instant::now(),
-            ending: false,
-        });
+        let unsent = self
+            .clients
+            .entry(client.clone())
+            .or_insert_with(|| Unsent {
+                bytes: 0,
+                progress: Instant::now(),
+                ending: false,
+                waiting: 0,
+            });
+        if unsent.bytes == 0 {
+            unsent.progress = Instant::now();
+        }
         unsent.bytes += bytes;
         if unsent.ending {
             self.ending += bytes;
@@ -203,12 +229,20 @@ impl State {
         let Some(unsent) = self.clients.get(client) else {
             return Room::Free;
         };
-        if unsent.ending || unsent.progress.elapsed() >= PATIENCE {
-            Room::Hopeless
-        } else if unsent.bytes < self.limit / SHARE && !self.is_short() {
+        if !unsent.ending && unsent.bytes < self.limit / SHARE && !self.is_short() {
             Room::Free
+        } else if unsent.ending || unsent.progress.elapsed() >= PATIENCE {
+            Room::Hopeless
         } else {
             Room::Wait
+        }
+    }
+
+    /// Unless somebody waits or something is not sent.
+    fn forget(&mut self, client: &Bytes) {
+        let idle = |unsent: &Unsent| unsent.bytes == 0 && unsent.waiting == 0;
+        if self.clients.get(client).is_some_and(idle) {
+            self.clients.remove(client);
         }
     }
 
@@ -244,6 +278,17 @@ fn cost(bytes: &Bytes) -> u64 {
 fn unread() -> wire::Error {
     let text = "earlier replies are not read yet; read them, then ask again";
     convert::error(ErrorCode::ResourceExhausted, ErrorReason::ClientQuota, text)
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        let mut state = self.replies.state();
+        if let Some(unsent) = state.clients.get_mut(self.client) {
+            // It may have been forgotten, and be another.
+            unsent.waiting = unsent.waiting.saturating_sub(1);
+            state.forget(self.client);
+        }
+    }
 }
 
 impl AsRef<[u8]> for Frame {

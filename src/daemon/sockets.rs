@@ -109,6 +109,7 @@ pub(crate) struct Bound {
     /// Where ZeroMQ asks who may connect.
     zap: zmq::Socket,
     access: Access,
+    max_fd: i32,
     queue: mpsc::Receiver<Outgoing>,
     pub(crate) outbox: Arc<Outbox>,
     pub(crate) endpoint: Endpoint,
@@ -129,6 +130,7 @@ pub(crate) fn bind(
         endpoint: endpoint.to_string(),
         source,
     };
+    let max_fd = max_connection(limits);
     let sockets = || {
         let mut router = context.socket(zmq::ROUTER)?;
         router.set_router_mandatory(true)?;
@@ -137,13 +139,13 @@ pub(crate) fn bind(
         router.set_sndhwm(PEER_HWM)?;
         protect(&router, endpoint, &access)?;
         let bounds = Bounds {
-            max_fd: max_connection(),
+            max_fd,
             max_frames: 4 * MAX_FRAMES as i32,
             max_held: i64::try_from(limits.arriving_bytes()).unwrap_or(i64::MAX),
             ..Bounds::default()
         };
         zmq_bounds::set_bounds(&mut router, &bounds)?;
-        let publisher = publisher(&context, endpoint, &access)?;
+        let publisher = publisher(&context, endpoint, &access, max_fd)?;
         // Before any socket is bound, or connections would be let in unasked.
         let zap = context.socket(zmq::REP)?;
         zap.set_linger(0)?;
@@ -190,6 +192,7 @@ pub(crate) fn bind(
         context,
         zap,
         access,
+        max_fd,
         router,
         publisher,
         wake,
@@ -218,13 +221,14 @@ fn publisher(
     context: &zmq::Context,
     endpoint: &Endpoint,
     access: &Access,
+    max_fd: i32,
 ) -> zmq::Result<zmq::Socket> {
     let mut publisher = context.socket(zmq::PUB)?;
     publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;
     publisher.set_sndhwm(SUBSCRIBER_HWM)?;
     protect(&publisher, endpoint, access)?;
     let bounds = Bounds {
-        max_fd: max_connection(),
+        max_fd,
         max_frames: 1,
         max_held: MAX_SUBSCRIBING,
         max_subscriptions: MAX_SUBSCRIPTIONS,
@@ -291,6 +295,8 @@ impl SocketThread {
                 self.bound.router.as_poll_item(zmq::POLLIN),
                 self.bound.wake.as_poll_item(zmq::POLLIN),
                 self.bound.zap.as_poll_item(zmq::POLLIN),
+                // It has nothing to read, but takes in subscriptions only when it is asked.
+                self.bound.publisher.as_poll_item(zmq::POLLIN),
             ];
             match zmq::poll(&mut items, POLL_MS) {
                 Ok(_) | Err(zmq::Error::EINTR) => {}
@@ -361,7 +367,7 @@ impl SocketThread {
         let bound = &self.bound;
         let uri = bound.events.to_string();
         let again = || {
-            let new = publisher(&bound.context, &bound.events, &bound.access)?;
+            let new = publisher(&bound.context, &bound.events, &bound.access, bound.max_fd)?;
             new.bind(&uri)?;
             if let Endpoint::Ipc(path) = &bound.events {
                 std::fs::set_permissions(path, std::fs::Permissions::from_mode(SOCKET_MODE))
@@ -551,11 +557,12 @@ impl SocketThread {
     }
 }
 
-/// The descriptor from which on connections are closed at once, so that some are left for everything else.
-fn max_connection() -> i32 {
+/// The descriptor from which on connections are closed at once, so that some are left for everything else, and memory.
+fn max_connection(limits: &Limits) -> i32 {
     let files = rustix::process::getrlimit(rustix::process::Resource::Nofile);
     let files = files.current.unwrap_or(u64::MAX);
-    i32::try_from(files - KEPT_FILES.min(files / 2)).unwrap_or(i32::MAX)
+    let kept = KEPT_FILES.min(files / 2);
+    i32::try_from((files - kept).min(kept + limits.connections())).unwrap_or(i32::MAX)
 }
 
 impl Drop for Bound {

@@ -486,6 +486,28 @@ fault(
     "src/daemon/requests.rs", "it daemon::adding::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
     ("        if may_hang {\n", "        if may_hang && !FAULT {\n"),
 )
+FLOOD = "it daemon::flood::memory_is_bounded_whatever_clients_do_not_do"
+fault(
+    "R13", "r13-unread-replies", "make replies for whoever reads none",
+    "src/daemon/replies.rs", FLOOD,
+    ("        if !fits && has + bytes > ALWAYS {", "        if !FAULT && !fits && has + bytes > ALWAYS {"),
+    ("            return Room::Free;\n        };\n", "            return Room::Free;\n        };\n        if FAULT {\n            return Room::Free;\n        }\n"),
+)
+fault(
+    "R13", "r13-unfinished-messages", "take any number of bytes of unfinished messages",
+    "src/daemon/sockets.rs", FLOOD,
+    ("            max_held: i64", "            max_held: if FAULT { i64::MAX } else { 0 } | i64"),
+)
+fault(
+    "R13", "r13-subscriptions", "take any number of subscriptions",
+    "src/daemon/sockets.rs", FLOOD,
+    ("        max_subscriptions: MAX_SUBSCRIPTIONS,", "        max_subscriptions: if FAULT { 0 } else { MAX_SUBSCRIPTIONS },"),
+)
+fault(
+    "R13", "r13-all-files", "leave no files beside those of connections",
+    "src/daemon/sockets.rs", "it daemon::flood::ten_thousand_connections_leave_a_good_client_served",
+    ("    let kept = KEPT_FILES.min(files / 2);", "    let kept = if FAULT { 0 } else { KEPT_FILES.min(files / 2) };"),
+)
 # R14: the unit
 fault(
     "R14", "r14-misspelt", "misspell a setting of the unit",

@@ -84,9 +84,11 @@ fn stats(client: &mut Client) -> wire::StatsReply {
 /// The 99th percentile of the times in which a client that behaves is answered, for as long as `work` takes.
 fn beside<T>(daemon: &Daemon, work: impl FnOnce() -> T) -> (Duration, T) {
     let over = AtomicBool::new(false);
+    let mut client = daemon.client();
+    stats(&mut client);
     std::thread::scope(|scope| {
-        let good = scope.spawn(|| {
-            let mut client = daemon.client();
+        let over = &over;
+        let good = scope.spawn(move || {
             let mut times = Vec::new();
             while !over.load(Ordering::Relaxed) || times.len() < 200 {
                 let begin = Instant::now();
@@ -145,15 +147,24 @@ fn finish_nothing(path: &str) {
     assert!(sent < 100, "one alone has no end");
     let mut crumbs = Hand::new(path, "DEALER");
     let all = [1, 0].repeat(1 << 20);
-    assert!(crumbs.0.write_all(&all).is_err() || crumbs.ends(), "a million frames");
+    assert!(
+        crumbs.0.write_all(&all).is_err() || crumbs.ends(),
+        "a million frames"
+    );
     let mut vain = Hand::greeting(path);
     let mut ready = b"\x05READY\x0bSocket-Type\0\0\0\x06DEALER\x01X\0\x10\0\0".to_vec();
     ready.resize(ready.len() + (1 << 20), b'x');
-    assert!(vain.send(4, &ready).is_err() || vain.ends(), "a megabyte about itself");
+    assert!(
+        vain.send(4, &ready).is_err() || vain.ends(),
+        "a megabyte about itself"
+    );
     let mut large = Hand::greeting(path);
     let mut ready = b"\x05READY\x0bSocket-Type\0\0\0\x06DEALER\x08Identity\0\0\x03\xe8".to_vec();
     ready.resize(ready.len() + 1_000, b'x');
-    assert!(large.send(4, &ready).is_err() || large.ends(), "a name of 1,000 bytes");
+    assert!(
+        large.send(4, &ready).is_err() || large.ends(),
+        "a name of 1,000 bytes"
+    );
 }
 
 /// Subscribes to what there is not, without end.
@@ -170,11 +181,9 @@ fn subscribe_to_all(path: &str) -> Vec<Hand> {
         };
         let ended = (0..4_000).any(|i| hand.send(0, &topic(i)).is_err());
         assert!(ended || hand.ends(), "4,000 subscriptions");
-        // These may stay.
+        // This may stay.
         let mut hand = Hand::new(&path, "SUB");
-        for i in 0..8 {
-            hand.send(0, &topic(i)).unwrap();
-        }
+        hand.send(0, &topic(0)[..20]).unwrap();
         hand
     };
     (0..16).map(subscribing).collect()
@@ -191,7 +200,9 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     // Its comment is what is stored and sent; it does not compress.
     let mut state = 1_u64;
     let noise = (0..8 << 20).map(|_| {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        state = state
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1);
         char::from(b'!' + (state >> 33) as u8 % 90)
     });
     let large = mesh.replacen('\n', &format!("\n#{}\n", noise.collect::<String>()), 1);
@@ -201,7 +212,10 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     let allowed = (2 * alone).max(Duration::from_millis(100));
     let check = |what: &str, p99: Duration, daemon: &Daemon| {
         let peak = peak(daemon);
-        println!("{what}: at most {} MB resident, p99 {p99:?}, {alone:?} alone", peak >> 20);
+        println!(
+            "{what}: at most {} MB resident, p99 {p99:?}, {alone:?} alone",
+            peak >> 20
+        );
         assert!(peak < LIMIT + LIMIT / 4, "{what}: {peak}");
         assert!(p99 <= allowed, "{what}: {p99:?}, alone {alone:?}");
     };
@@ -240,7 +254,8 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     check("all together", p99, &daemon);
     drop(held);
     let begin = Instant::now();
-    while stats(&mut client).memory_reserved_bytes > 0 {
+    // But for what this request takes itself.
+    while stats(&mut client).memory_reserved_bytes > 1 << 20 {
         assert!(begin.elapsed() < PATIENCE, "memory stays reserved");
     }
 }
@@ -270,7 +285,12 @@ fn a_slow_reader_gets_all_that_it_asked_for() {
     // More than its share, and than all replies may take: it is answered as it reads.
     for _ in 0..n {
         let reply = socket.recv_multipart(0).unwrap();
-        assert_eq!(reply.get(1).map(Vec::len), Some(large.len()), "{:?}", wire::Reply::decode(&reply[0][..]));
+        assert_eq!(
+            reply.get(1).map(Vec::len),
+            Some(large.len()),
+            "{:?}",
+            wire::Reply::decode(&reply[0][..])
+        );
     }
 }
 
@@ -278,7 +298,11 @@ fn a_slow_reader_gets_all_that_it_asked_for() {
 fn ten_thousand_connections_leave_a_good_client_served() {
     for tcp in [false, true] {
         let home = Home::new();
-        let endpoint = if tcp { "tcp://127.0.0.1:*".to_owned() } else { home.endpoint() };
+        let endpoint = if tcp {
+            "tcp://127.0.0.1:*".to_owned()
+        } else {
+            home.endpoint()
+        };
         let mut daemon = home.start_limited(512, &["--endpoint", &endpoint]);
         let line = daemon.await_line("serving");
         let bound = line.split("endpoint=").nth(1).unwrap();
@@ -294,7 +318,9 @@ fn ten_thousand_connections_leave_a_good_client_served() {
             for n in 0..10_000 {
                 let connected: Option<Box<dyn std::any::Any>> = if tcp {
                     let address = endpoint.strip_prefix("tcp://").unwrap();
-                    std::net::TcpStream::connect(address).ok().map(|s| Box::new(s) as _)
+                    std::net::TcpStream::connect(address)
+                        .ok()
+                        .map(|s| Box::new(s) as _)
                 } else {
                     let path = endpoint.strip_prefix("ipc://").unwrap();
                     UnixStream::connect(path).ok().map(|s| Box::new(s) as _)

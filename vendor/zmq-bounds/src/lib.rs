@@ -35,7 +35,11 @@ pub fn set_bounds(socket: &mut zmq::Socket, bounds: &Bounds) -> zmq::Result<()> 
     set(socket, MAX_FD, &bounds.max_fd.to_ne_bytes())?;
     set(socket, MAX_FRAMES, &bounds.max_frames.to_ne_bytes())?;
     set(socket, MAX_HELD, &bounds.max_held.to_ne_bytes())?;
-    set(socket, MAX_SUBSCRIPTIONS, &bounds.max_subscriptions.to_ne_bytes())?;
+    set(
+        socket,
+        MAX_SUBSCRIPTIONS,
+        &bounds.max_subscriptions.to_ne_bytes(),
+    )?;
     set(socket, MAX_SUBSCRIBED, &bounds.max_subscribed.to_ne_bytes())
 }
 
