@@ -6,6 +6,7 @@ mod correcting;
 mod isolation;
 mod life;
 mod overload;
+mod paths;
 mod repeats;
 mod security;
 mod stages;
