@@ -83,9 +83,7 @@ pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
             }
         }
     }
-    let connection = Connection::open(&path)?;
-    schema::register_row_sum(&connection)?;
-    connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
+    let connection = catalog::open_reader(&path)?;
     let reader = catalog::Reader::new(&connection);
     let (library, committed) = (reader.library_id()?, reader.n_commits()?);
     if let Found::Whole(old) = Witness::read(&path)?
@@ -93,6 +91,11 @@ pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
     {
         return Err(refused());
     }
+    drop(connection);
+    // What is left of the log, into the file.
+    let connection = Connection::open(&path)?;
+    connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
+    drop(connection);
     let witness = Witness {
         library,
         settled: committed,

@@ -483,7 +483,7 @@ fault(
 )
 fault(
     "R13", "r13-turn-kept-while-a-file-hangs", "keep everybody waiting for a file that hangs",
-    "src/daemon/requests.rs", "it daemon::adding::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
+    "src/daemon/requests.rs", "it daemon::paths::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
     ("        if may_hang {\n", "        if may_hang && !FAULT {\n"),
 )
 FLOOD = "it daemon::flood::memory_is_bounded_whatever_clients_do_not_do"

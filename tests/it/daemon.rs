@@ -8,6 +8,7 @@ mod http_abuse;
 mod isolation;
 mod life;
 mod overload;
+mod paths;
 mod refusing;
 mod repeats;
 mod resident;

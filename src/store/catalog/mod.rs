@@ -193,13 +193,22 @@ impl Catalog {
             .map_err(|e| self.failed(e));
         writer.connection.busy_timeout(BUSY_TIMEOUT)?;
         let copied = busy? == 0;
-        if copied && let Found::Whole(old) = Witness::read(&self.path)? {
-            let settled = Witness {
-                settled: number.max(old.settled),
-                committed: number.max(old.committed),
-                ..old
+        if copied {
+            let (library, old) = match Witness::read(&self.path)? {
+                Found::Whole(old) => (old.library.clone(), Some(old)),
+                // Whoever took it away gets another.
+                _ => (Reader::new(&writer.connection).library_id()?, None),
             };
-            settled.write(&self.path)?;
+            let at_least = |before: Option<u64>| number.max(before.unwrap_or(0));
+            let witness = Witness {
+                library,
+                settled: at_least(old.as_ref().map(|w| w.settled)),
+                committed: at_least(old.as_ref().map(|w| w.committed)),
+            };
+            witness.write(&self.path).map_err(|error| match error {
+                StoreError::NoSpace { .. } => error,
+                error => self.health.stop(error.to_string()),
+            })?;
         }
         Ok(copied)
     }
@@ -264,6 +273,7 @@ impl Drop for Catalog {
 
 /// Sees to it that there is a witness that promises what the catalog holds.
 fn bear_witness(connection: &Connection, path: &Path) -> Result<(), StoreError> {
+    Witness::tidy(path)?;
     let reader = Reader::new(connection);
     let (library, committed) = match (reader.library_id(), reader.n_commits()) {
         (Ok(library), Ok(committed)) => (library, committed),

@@ -103,31 +103,53 @@ impl Witness {
     /// Writes it, durably, in the place of the one that is there.
     pub(in crate::store) fn write(&self, catalog: &Path) -> Result<(), StoreError> {
         let path = path_of(catalog);
-        let mut temporary = path.clone().into_os_string();
-        temporary.push(".new");
-        let temporary = PathBuf::from(temporary);
-        let written = std::fs::remove_file(&temporary)
-            .or_else(|e| match e.kind() {
-                io::ErrorKind::NotFound => Ok(()),
-                _ => Err(e),
-            })
+        // Others may be at it, after checkpoints of theirs.
+        let temporary = path.with_extension(format!("commits.{}", std::process::id()));
+        let written = remove_if_there(&temporary)
             .and_then(|()| {
                 let mut file = RealDisk.create(&temporary)?;
                 file.write_all(self.text().as_bytes())?;
                 file.sync()
             })
             .and_then(|()| RealDisk.rename(&temporary, &path))
-            .and_then(|()| RealDisk.sync_dir(folder_of(catalog)));
+            .and_then(|()| RealDisk.sync_dir(folder_of(catalog)))
+            .inspect_err(|_| {
+                let _ = std::fs::remove_file(&temporary);
+            });
         written.map_err(|e| StoreError::io(&path, e))
+    }
+
+    /// Removes what processes left that ended while they wrote it. For whoever holds the library, before others write.
+    pub(in crate::store) fn tidy(catalog: &Path) -> Result<(), StoreError> {
+        let folder = folder_of(catalog);
+        let tidied = std::fs::read_dir(folder).and_then(|mut entries| {
+            entries.try_for_each(|entry| {
+                let entry = entry?;
+                match entry
+                    .file_name()
+                    .to_string_lossy()
+                    .strip_prefix(WITNESS_FILE)
+                {
+                    Some(rest) if rest.starts_with('.') => remove_if_there(&entry.path()),
+                    _ => Ok(()),
+                }
+            })
+        });
+        tidied.map_err(|e| StoreError::io(folder, e))
     }
 
     /// Notes that commit `committed` is durable, unless a later one is noted already. Without a whole
     /// witness of this library there is nothing to note it in.
     pub(in crate::store) fn advance(catalog: &Path, committed: u64) -> io::Result<()> {
-        let file = File::options()
+        let opened = File::options()
             .read(true)
             .write(true)
-            .open(path_of(catalog))?;
+            .open(path_of(catalog));
+        let file = match opened {
+            // The next checkpoint makes one.
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+            opened => opened?,
+        };
         let mut bytes = [0; 256];
         let n = file.read_at(&mut bytes, 0)?;
         let Found::Whole(mut witness) = Self::parse(&bytes[..n]) else {
@@ -292,6 +314,13 @@ fn said_by(connection: &Connection) -> Result<Said, StoreError> {
         library: reader.meta(LIBRARY_ID)?.unwrap_or_default(),
         commits: reader.n_commits()?,
     })
+}
+
+fn remove_if_there(path: &Path) -> io::Result<()> {
+    match std::fs::remove_file(path) {
+        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(e),
+        _ => Ok(()),
+    }
 }
 
 fn path_of(catalog: &Path) -> PathBuf {
