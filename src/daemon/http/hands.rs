@@ -17,8 +17,10 @@ const N_THREADS: usize = 2;
 const N_WORKING: usize = 2;
 /// Those, and one that reads metrics.
 const N_BLOCKING: usize = N_WORKING + 1;
-/// As much as describing and placing give way: a page waits rather than a client of the sockets.
-const NICENESS: i32 = 5;
+/// The priority of those that wait, before the workers, and of those that work, beside them: a page
+/// waits rather than a client of the sockets.
+const WAITING_NICENESS: i32 = 1;
+const WORKING_NICENESS: i32 = 5;
 /// Requests of viewers in hand, and of those for which the daemon is asked at a time: both kinds
 /// together fewer than there are connections, so that some can always make way.
 const READS: (usize, usize) = (48, 8);
@@ -30,6 +32,7 @@ pub(super) fn runtime() -> std::io::Result<Runtime> {
         .worker_threads(N_THREADS)
         .max_blocking_threads(N_BLOCKING)
         .thread_name("http")
+        .on_thread_start(|| give_way(WAITING_NICENESS))
         .enable_io()
         .enable_time()
         .build()
@@ -144,14 +147,18 @@ pub(super) async fn beside<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, wire::Error> {
     let done = tokio::task::spawn_blocking(move || {
-        // Of this thread alone. An error means that it keeps the priority it has.
-        let _ = rustix::process::setpriority_process(None, NICENESS);
+        give_way(WORKING_NICENESS);
         work()
     });
     done.await.map_err(|e| match e.try_into_panic() {
         Ok(panic) => panic_error(&panic_text(panic.as_ref())),
         Err(e) => panic_error(&e.to_string()),
     })
+}
+
+/// Lowers the priority of this thread alone. An error means that it keeps the one it has.
+fn give_way(niceness: i32) {
+    let _ = rustix::process::setpriority_process(None, niceness);
 }
 
 /// Memory is in use.
