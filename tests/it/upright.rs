@@ -9,7 +9,7 @@ use coseg::synth::{Family, Labelled, family};
 /// clustered at other sizes.
 const SLACK: f64 = 0.03;
 
-fn chairs(n: usize) -> Vec<Labelled> {
+fn chairs(n: u32) -> Vec<Labelled> {
     family(Family::Chair, 31, n, &SMALL)
 }
 

@@ -14,7 +14,7 @@ const FEW_FACES: Options = Options {
 };
 
 /// A folder with chairs that stand along +y.
-fn folder_of_chairs(home: &Home, n: usize) -> String {
+fn folder_of_chairs(home: &Home, n: u32) -> String {
     let folder = home.path("chairs");
     std::fs::create_dir(&folder).unwrap();
     for chair in family(Family::Chair, 31, n, &FEW_FACES) {
