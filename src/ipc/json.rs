@@ -102,6 +102,8 @@ fn report(r: &wire::CleanReport) -> Value {
         "n_proxy_faces": r.n_proxy_faces,
         "n_proxy_vertices": r.n_proxy_vertices,
         "n_bridges": r.n_bridges,
+        "n_inner_walls": r.n_inner_walls,
+        "n_inner_triangles": r.n_inner_triangles,
     })
 }
 

@@ -243,13 +243,14 @@ fn polygon_classes(
     }
     let format = format_from_name(format, "shapes.format")?;
     let bytes = original()?;
-    // The same bytes passed these two steps when they were described.
+    // The same bytes passed these steps when they were described.
     let Ok(parsed) = mesh::parse(&bytes, format) else {
         return Ok(plain());
     };
     let Ok(cleaned) = mesh::clean(&parsed) else {
         return Ok(plain());
     };
+    let cleaned = mesh::outer_shells(cleaned);
     let mut proxy_face = vec![0u32; cleaned.mesh.faces.len()];
     let mut seen = vec![false; proxy_face.len()];
     for (t, face) in cleaned.face_of_triangle.iter().enumerate() {

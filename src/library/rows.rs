@@ -136,11 +136,12 @@ pub fn report_to_json(report: &CleanReport) -> Value {
 
 pub(super) fn report_from_json(text: &str, place: &str) -> Result<CleanReport> {
     let value: Value = from_json(text, place)?;
-    CleanReport::from_counts(|name| {
+    let count = |name| {
         let n = value.get(name).and_then(Value::as_u64);
         n.map(|n| n as usize)
             .ok_or_else(|| damaged(place, &format!("no count {name:?}")))
-    })
+    };
+    CleanReport::from_counts(count, |name| value.get(name).is_none())
 }
 
 pub(super) fn quality_to_json(q: &Quality) -> String {

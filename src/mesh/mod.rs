@@ -14,6 +14,7 @@ mod parse;
 mod proxy;
 mod refine;
 mod report;
+mod shells;
 mod vector;
 #[cfg(test)]
 pub(crate) mod zoo;
@@ -25,6 +26,7 @@ pub use clean::{CleanError, Cleaned, clean};
 pub use geodesic::EdgeGraph;
 pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, parse};
 pub use proxy::{Proxy, proxy};
+pub use shells::outer_shells;
 pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 
 pub mod write;
@@ -153,6 +155,10 @@ pub struct CleanReport {
     pub n_proxy_faces: usize,
     /// Vertices of the proxy.
     pub n_proxy_vertices: usize,
-    /// Bridges put between components of the proxy.
+    /// Bridges put between components of what is analysed.
     pub n_bridges: usize,
+    /// Components that are left out of the analysis: another one at a small distance stands for each.
+    pub n_inner_walls: usize,
+    /// Triangles of these.
+    pub n_inner_triangles: usize,
 }

@@ -8,7 +8,7 @@ use crate::segmentation::patches;
 use crate::spectrum::{self, Eigenpairs, Progress, SpectrumError};
 
 /// Part of the name of every description: raised when the same bytes would give other arrays.
-pub const ALGORITHM_VERSION: u32 = 4;
+pub const ALGORITHM_VERSION: u32 = 5;
 /// Heat kernel signature times.
 pub const N_HKS_TIMES: usize = 100;
 /// Eigenvectors that are kept; all eigenvalues are.
@@ -66,7 +66,7 @@ pub fn describe(
     enter("parse")?;
     let parsed = mesh::parse(bytes, format)?;
     enter("clean")?;
-    let cleaned = mesh::clean(&parsed)?;
+    let cleaned = mesh::outer_shells(mesh::clean(&parsed)?);
     enter("proxy")?;
     let proxy = mesh::proxy(&cleaned.mesh, params.working_faces);
     // What is stored is f32: everything below is computed from exactly that.

@@ -431,5 +431,8 @@ fn number<T: std::str::FromStr>(
 }
 
 fn report_from(metadata: &Metadata) -> Result<CleanReport, ArrayFileError> {
-    CleanReport::from_counts(|name| number(metadata, name, "a count"))
+    CleanReport::from_counts(
+        |name| number(metadata, name, "a count"),
+        |name| !metadata.contains_key(name),
+    )
 }

@@ -6,7 +6,8 @@ use crate::ipc::wire;
 use crate::library::{Labels, ShapeInfo};
 use crate::mesh::{CleanReport, Format};
 
-fn report(r: &CleanReport) -> wire::CleanReport {
+/// What cleaning found.
+pub fn report(r: &CleanReport) -> wire::CleanReport {
     wire::CleanReport {
         n_polygons: r.n_polygons as u64,
         n_triangles: r.n_triangles as u64,
@@ -22,6 +23,8 @@ fn report(r: &CleanReport) -> wire::CleanReport {
         n_proxy_vertices: r.n_proxy_vertices as u64,
         n_bridges: r.n_bridges as u64,
         n_flipped_triangles: r.n_flipped_triangles as u64,
+        n_inner_walls: r.n_inner_walls as u64,
+        n_inner_triangles: r.n_inner_triangles as u64,
     }
 }
 

@@ -277,7 +277,8 @@ function meshText(shape) {
   const found = [
     [r.n_components > 1 && r.n_components, "components"], [r.n_welded_vertices, "vertices welded"],
     [r.n_degenerate_triangles, "degenerate triangles dropped"], [r.n_duplicate_triangles, "duplicate triangles dropped"],
-    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"], [r.n_bridges, "virtual edges"],
+    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"],
+    [r.n_inner_walls, "inner walls left to those around them"], [r.n_bridges, "virtual edges"],
   ].filter(([n]) => n > 0).map(([n, what]) => `${n} ${what}`);
   return `${found.join(", ") || "clean"}; worked on with ${r.n_proxy_faces} faces`;
 }
