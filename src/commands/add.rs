@@ -25,9 +25,9 @@ const JOBS_AHEAD: usize = 4;
 /// Name of the collection that is created when none is named and there is none.
 const DEFAULT_COLLECTION: &str = "default";
 /// What lies beside meshes and is passed over without a word.
-const BESIDE_MESHES: [&str; 16] = [
+const BESIDE_MESHES: [&str; 19] = [
     "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg",
-    "npy", "npz", "html",
+    "npy", "npz", "html", "bin", "webp", "ktx2",
 ];
 
 /// A mesh file to send.
@@ -78,7 +78,7 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     let mut jobs = VecDeque::new();
     let mut batch = Batch::default();
     for file in &files {
-        let bytes = match std::fs::read(&file.path) {
+        let bytes = match super::mesh_file::read(&file.path, file.format) {
             Ok(bytes) => bytes,
             Err(e) => {
                 report.refused(&file.name, &format!("{}: {e}", file.path.display()));
