@@ -2,9 +2,11 @@
 
 use super::describe_full::{Signatures, full};
 use super::session::print_line;
+use super::show::found;
 use super::{CommandError, Outcome};
 use crate::cli::Global;
 use clap::Args;
+use coseg::ipc::convert::report;
 use coseg::library::report_to_json;
 use coseg::mesh::{CleanReport, Format};
 use coseg::pipeline::{Params, describe};
@@ -20,7 +22,7 @@ use std::time::Instant;
 /// `coseg describe`
 #[derive(Debug, Args)]
 pub(crate) struct Describe {
-    /// A mesh file (.obj, .off, .ply, .stl, .glb, .gltf)
+    /// A mesh file (.obj, .off, .ply, .stl, .glb, .gltf with its .bin beside it)
     pub(crate) mesh: PathBuf,
     /// Write the arrays to this safetensors file
     #[arg(long, short, value_name = "FILE")]
@@ -141,7 +143,7 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
             Format::EXTENSIONS
         )));
     };
-    let bytes = fs::read(&args.mesh).map_err(file)?;
+    let bytes = super::mesh_file::read(&args.mesh, format).map_err(file)?;
     let defaults = Params::default();
     let params = Params {
         operator: args.operator.to_domain(),
@@ -280,6 +282,7 @@ fn print(
         summary.area,
         summary.eigenvalues.len(),
     ))?;
+    print_line(&found(&report(&summary.report)))?;
     if let Some((_, certificate)) = &summary.spectrum {
         print_line(&proof(certificate))?;
     }

@@ -27,6 +27,7 @@ mod ls;
 mod man;
 mod map;
 mod merge;
+mod mesh_file;
 mod name;
 mod nearest;
 mod render;

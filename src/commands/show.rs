@@ -75,6 +75,35 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     Ok(true)
 }
 
+/// What cleaning found, in words.
+pub(super) fn found(r: &wire::CleanReport) -> String {
+    let inner = format!(
+        "inner walls left to those around them ({} triangles)",
+        r.n_inner_triangles
+    );
+    let counts = [
+        ("vertices welded", r.n_welded_vertices),
+        ("isolated vertices", r.n_isolated_vertices),
+        ("degenerate triangles dropped", r.n_degenerate_triangles),
+        ("duplicate triangles dropped", r.n_duplicate_triangles),
+        ("triangles turned over", r.n_flipped_triangles),
+        ("non-manifold edges", r.n_nonmanifold_edges),
+        ("boundary edges", r.n_boundary_edges),
+        (&inner, r.n_inner_walls),
+        ("virtual edges between components", r.n_bridges),
+    ];
+    let found: Vec<String> = counts
+        .iter()
+        .filter(|(_, n)| *n > 0)
+        .map(|(what, n)| format!("{n} {what}"))
+        .collect();
+    let found = match found.is_empty() {
+        true => "clean".to_owned(),
+        false => found.join(", "),
+    };
+    format!("mesh: {} components, {found}", r.n_components)
+}
+
 fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session) -> Outcome {
     if session.json {
         session.print_json(&json::shape(s))?;
@@ -86,30 +115,7 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
         s.name, s.ordinal, s.n_polygons, s.area, s.version
     ))?;
     if let Some(r) = &s.report {
-        let counts = [
-            ("vertices welded", r.n_welded_vertices),
-            ("isolated vertices", r.n_isolated_vertices),
-            ("degenerate triangles dropped", r.n_degenerate_triangles),
-            ("duplicate triangles dropped", r.n_duplicate_triangles),
-            ("triangles turned over", r.n_flipped_triangles),
-            ("non-manifold edges", r.n_nonmanifold_edges),
-            ("boundary edges", r.n_boundary_edges),
-            ("virtual edges between components", r.n_bridges),
-        ];
-        let found: Vec<String> = counts
-            .iter()
-            .filter(|(_, n)| *n > 0)
-            .map(|(what, n)| format!("{n} {what}"))
-            .collect();
-        let found = if found.is_empty() {
-            "clean".to_owned()
-        } else {
-            found.join(", ")
-        };
-        session.line(&format!(
-            "mesh: {} components, {found}; proxy of {} faces",
-            r.n_components, r.n_proxy_faces
-        ))?;
+        session.line(&format!("{}; proxy of {} faces", found(r), r.n_proxy_faces))?;
     }
     let mut rows = vec![
         ["part", "label", "area", "confidence"]

@@ -18,6 +18,20 @@ fn up_to_wire(up: Up) -> wire::Up {
     }
 }
 
+/// Which way is up.
+pub fn up_from_wire(up: wire::Up) -> Up {
+    match up {
+        wire::Up::PlusX => Up::PlusX,
+        wire::Up::MinusX => Up::MinusX,
+        wire::Up::PlusY => Up::PlusY,
+        wire::Up::MinusY => Up::MinusY,
+        wire::Up::PlusZ => Up::PlusZ,
+        wire::Up::MinusZ => Up::MinusZ,
+        wire::Up::Unspecified | wire::Up::Unknown => Up::Unknown,
+        wire::Up::Auto => Up::Auto,
+    }
+}
+
 fn operator_to_wire(operator: Operator) -> wire::Operator {
     match operator {
         Operator::Tufted => wire::Operator::Tufted,
@@ -39,16 +53,7 @@ pub fn collection_spec(
             format!("{field} is {value}, which this version does not know"),
         )
     };
-    let up = match wire::Up::try_from(spec.up).map_err(|_| range("up", spec.up))? {
-        wire::Up::PlusX => Up::PlusX,
-        wire::Up::MinusX => Up::MinusX,
-        wire::Up::PlusY => Up::PlusY,
-        wire::Up::MinusY => Up::MinusY,
-        wire::Up::PlusZ => Up::PlusZ,
-        wire::Up::MinusZ => Up::MinusZ,
-        wire::Up::Unspecified | wire::Up::Unknown => Up::Unknown,
-        wire::Up::Auto => Up::Auto,
-    };
+    let up = up_from_wire(wire::Up::try_from(spec.up).map_err(|_| range("up", spec.up))?);
     let operator =
         wire::Operator::try_from(spec.operator).map_err(|_| range("operator", spec.operator))?;
     let operator = match operator {

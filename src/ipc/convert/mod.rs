@@ -12,7 +12,7 @@ pub use analysis::{
     agreement, descriptors, functional_map, hks, nearest, part_correspondence, point_maps,
     point_request, polygon_values, spectrum, transferred,
 };
-pub use collections::{collection, collection_differs, collection_spec, label_info};
+pub use collections::{collection, collection_differs, collection_spec, label_info, up_from_wire};
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{
     error, failure, field_error, frame_error, library_error, library_failure, with_subject,
@@ -21,4 +21,4 @@ pub use events::event;
 pub use jobs::{
     Ingest, add_shapes, carrying_job, format_from_wire, item, job_finished, mesh_format, new_shapes,
 };
-pub use shapes::{labels, labels_snapshot, original, shape};
+pub use shapes::{labels, labels_snapshot, original, report, shape};
