@@ -21,5 +21,8 @@ fuzz_target!(|bytes: &[u8]| {
     assert!(parsed.triangles.iter().flatten().all(|&v| (v as usize) < n));
     if let Ok(cleaned) = mesh::clean(&parsed) {
         assert_eq!(cleaned.face_of_polygon.len(), parsed.n_polygons);
+        let shells = mesh::outer_shells(cleaned);
+        let n_faces = shells.mesh.faces.len();
+        assert!(shells.face_of_polygon.iter().all(|&f| (f as usize) < n_faces));
     }
 });

@@ -76,7 +76,7 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     let mut jobs = VecDeque::new();
     let mut batch = Batch::default();
     for file in &files {
-        let bytes = match std::fs::read(&file.path) {
+        let bytes = match super::mesh_file::read(&file.path, file.format) {
             Ok(bytes) => bytes,
             Err(e) => {
                 report.refused(&file.name, &format!("{}: {e}", file.path.display()));

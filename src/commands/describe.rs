@@ -22,7 +22,7 @@ use std::time::Instant;
 /// `coseg describe`
 #[derive(Debug, Args)]
 pub(crate) struct Describe {
-    /// A mesh file (.obj, .off, .ply, .stl, .glb, .gltf)
+    /// A mesh file (.obj, .off, .ply, .stl, .glb, .gltf with its .bin beside it)
     pub(crate) mesh: PathBuf,
     /// Write the arrays to this safetensors file
     #[arg(long, short, value_name = "FILE")]
@@ -143,7 +143,7 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
             Format::EXTENSIONS
         )));
     };
-    let bytes = fs::read(&args.mesh).map_err(file)?;
+    let bytes = super::mesh_file::read(&args.mesh, format).map_err(file)?;
     let defaults = Params::default();
     let params = Params {
         operator: args.operator.to_domain(),

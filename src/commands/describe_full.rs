@@ -46,8 +46,9 @@ pub(super) fn full(task: &Task<'_>) -> Result<Summary, Trouble> {
     laps.enter("parse");
     let parsed = mesh::parse(bytes, format).map_err(Trouble::mesh)?;
     laps.enter("clean");
-    let cleaned = mesh::clean(&parsed).map_err(Trouble::mesh)?;
+    let mut cleaned = mesh::clean(&parsed).map_err(Trouble::mesh)?;
     let bridges = mesh::bridges(&cleaned.mesh);
+    cleaned.report.n_bridges = bridges.len();
     let stage = |name: &str| laps.enter(name);
     let found = spectrum_of(&cleaned.mesh, &bridges, params, &stage).map_err(Trouble::mesh)?;
     let signatures = match out {

@@ -6,7 +6,7 @@ use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat};
 use coseg::call;
 use coseg::ipc::client::ClientError;
-use coseg::ipc::convert::format_from_wire;
+use coseg::ipc::convert::{format_from_wire, up_from_wire};
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
 use coseg::mesh::write::{glb, mtl, npy, obj, ply, seg, usda};
@@ -22,7 +22,8 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
     }
-    let infos = session.describe(&collection)?.labels;
+    let described = session.describe(&collection)?;
+    let (infos, up) = (&described.labels, up_axis(&described));
     let shapes = match args.shapes.as_slice() {
         [] => session
             .shapes(&collection, None)?
@@ -49,17 +50,17 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             confidence: false,
         };
         let labels = labels::receive(&mut session, request)?.labels;
-        let (name, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, &infos) {
+        let (name, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, infos) {
             found
         } else {
             let mesh = original(&mut session, &collection, shape, labels.len())?;
-            with_mesh(args.format, shape, &mesh, &labels, &infos)
+            with_mesh(args.format, shape, (&mesh, up), &labels, infos)
         };
         write(name, &bytes)?;
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        let named: Vec<(String, [u8; 3])> = materials(&infos)
+        let named: Vec<(String, [u8; 3])> = materials(infos)
             .into_iter()
             .map(|(_, name, colour)| (name, colour))
             .collect();
@@ -104,11 +105,22 @@ fn without_mesh(
     })
 }
 
-/// Name and bytes of a file that holds the mesh with its labels.
+/// The axis that is up in the files of a collection: the one it was given, or that most shapes agree on.
+fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
+    let given = collection.spec.as_ref().map(wire::CollectionSpec::up)?;
+    let estimate = collection.up_estimate.as_ref();
+    let up = match given {
+        wire::Up::Auto => estimate?.up(),
+        given => given,
+    };
+    up_from_wire(up).axis()
+}
+
+/// Name and bytes of a file that holds the mesh, with its up axis, and its labels.
 fn with_mesh(
     format: ExportFormat,
     shape: &str,
-    mesh: &ParsedMesh,
+    (mesh, up): (&ParsedMesh, Option<[f64; 3]>),
     labels: &[i32],
     infos: &[wire::LabelInfo],
 ) -> (String, Vec<u8>) {
@@ -121,11 +133,11 @@ fn with_mesh(
             (format!("{shape}.obj"), text.into_bytes())
         }
         ExportFormat::Glb => {
-            let bytes = glb(shape, vertices, &polygons, labels, named);
+            let bytes = glb(shape, vertices, &polygons, labels, up, named);
             (format!("{shape}.glb"), bytes)
         }
         ExportFormat::Usda => {
-            let text = usda(shape, vertices, &polygons, labels, named);
+            let text = usda(shape, vertices, &polygons, labels, up, named);
             (format!("{shape}.usda"), text.into_bytes())
         }
         _ => {

@@ -12,9 +12,9 @@ const JOIN: &str = "__";
 /// Most entries of subfolders that are looked at only to say what is there.
 const MOST_LOOKED_AT: usize = 10_000;
 /// What lies beside meshes and is passed over without a word.
-const BESIDE_MESHES: [&str; 16] = [
+const BESIDE_MESHES: [&str; 19] = [
     "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg",
-    "npy", "npz", "html",
+    "npy", "npz", "html", "bin", "webp", "ktx2",
 ];
 
 /// A mesh file to send.

@@ -23,6 +23,7 @@ mod ls;
 mod man;
 mod map;
 mod merge;
+mod mesh_file;
 mod mesh_files;
 mod name;
 mod nearest;

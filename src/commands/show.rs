@@ -79,6 +79,10 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
 
 /// What cleaning found and did, in words.
 pub(super) fn found(r: &wire::CleanReport) -> String {
+    let inner = format!(
+        "inner walls left to those around them ({} triangles)",
+        r.n_inner_triangles
+    );
     let counts = [
         ("vertices welded", r.n_welded_vertices),
         ("isolated vertices", r.n_isolated_vertices),
@@ -87,6 +91,7 @@ pub(super) fn found(r: &wire::CleanReport) -> String {
         ("triangles turned over", r.n_flipped_triangles),
         ("non-manifold edges", r.n_nonmanifold_edges),
         ("boundary edges", r.n_boundary_edges),
+        (inner.as_str(), r.n_inner_walls),
         ("virtual edges between components", r.n_bridges),
         ("concave polygons", r.n_concave_polygons),
         ("polygons not planar", r.n_nonplanar_polygons),

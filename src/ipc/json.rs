@@ -114,6 +114,8 @@ fn report(r: &wire::CleanReport) -> Value {
         "n_nonsimple_polygons": r.n_nonsimple_polygons,
         "n_tolerated_statements": r.n_tolerated_statements,
         "n_unread_statements": r.n_unread_statements,
+        "n_inner_walls": r.n_inner_walls,
+        "n_inner_triangles": r.n_inner_triangles,
     })
 }
 

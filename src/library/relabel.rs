@@ -257,6 +257,7 @@ fn polygon_classes(
     let Ok(cleaned) = mesh::clean(&parsed) else {
         return Ok(plain());
     };
+    let cleaned = mesh::outer_shells(cleaned);
     let mut proxy_face = vec![0u32; cleaned.mesh.faces.len()];
     let mut seen = vec![false; proxy_face.len()];
     for (t, face) in cleaned.face_of_triangle.iter().enumerate() {

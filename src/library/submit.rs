@@ -647,6 +647,7 @@ mod tests {
         for change in [
             |r: &mut CleanReport| r.n_concave_polygons = 1,
             |r: &mut CleanReport| r.n_tolerated_statements = 1,
+            |r: &mut CleanReport| r.n_inner_walls = 1,
         ] {
             assert_eq!(with(change), format!("{first} reading 2"));
         }

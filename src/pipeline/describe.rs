@@ -70,7 +70,7 @@ pub fn describe(
     enter("parse")?;
     let parsed = mesh::parse(bytes, format)?;
     enter("clean")?;
-    let cleaned = mesh::clean(&parsed)?;
+    let cleaned = mesh::outer_shells(mesh::clean(&parsed)?);
     enter("proxy")?;
     let proxy = mesh::proxy(&cleaned.mesh, params.working_faces);
     // What is stored is f32: everything below is computed from exactly that.

@@ -63,6 +63,13 @@ for path in sorted(inputs.iterdir()):
     for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
         of_subsets[list(subset.GetIndicesAttr().Get())] = subset.GetPrim().GetAttribute("label").Get()
     assert np.array_equal(of_subsets, labels), name
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1, name
+    # What is up in the files, +z, is up in glTF: +y.
+    upright = trimesh.load(outputs / f"{name}.glb", process=False, force="scene").bounds
+    used = np.unique(np.concatenate([np.asarray(p) for p in polygons]))
+    lying = np.stack([ply["vertex"][c] for c in "xyz"], axis=1)[used]
+    assert np.allclose(upright[:, 1], [lying[:, 2].min(), lying[:, 2].max()], atol=1e-5), name
+    assert np.allclose(upright[:, 2], [-lying[:, 1].max(), -lying[:, 1].min()], atol=1e-5), name
     valid, why = UsdGeom.Subset.ValidateFamily(mesh, "face", "materialBind")
     assert valid, why
     print(f"{name:<14}{len(labels):>7}  {str(np.unique(labels).tolist()):<14} same     same         same same same")

@@ -21,7 +21,7 @@ export COSEG_ENDPOINT="ipc://$work/s"
 "$coseg" serve --library "$work/library" --log-level error &
 daemon=$!
 for _ in $(seq 100); do "$coseg" stats >/dev/null 2>&1 && break; sleep 0.1; done
-"$coseg" add "$work/in" --collection all --parts 4
+"$coseg" add "$work/in" --collection all --parts 4 --up +z
 for format in labels seg npy json ply obj glb usda; do
     "$coseg" export --format "$format" --out "$work/out"
 done

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -32,6 +33,7 @@ SAID = {
     "n_nonsimple_polygons": "polygons that cross themselves or have no area: {}",
     "n_tolerated_statements": "statements that programs differ about: {}",
     "n_unread_statements": "other statements, not read: {}",
+    "n_inner_walls": "inner walls left to those around them: {}",
 }
 CUBE_OFF = "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
 
@@ -173,7 +175,9 @@ def reason(became: dict[str, object]) -> str:
     """What the daemon says of a shape that it refuses."""
     error = became.get("error")
     message = error.get("message", "") if isinstance(error, dict) else ""
-    return str(message).replace("|", "\\|").replace("\n", " ")
+    # The name of the file, without the folder that is another in each run.
+    message = re.sub(r"^\S*/", "", str(message))
+    return message.replace("|", "\\|").replace("\n", " ")
 
 
 if __name__ == "__main__":

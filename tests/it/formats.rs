@@ -19,7 +19,7 @@ fn in_every_format() -> Vec<(&'static str, Vec<u8>)> {
     let labels = vec![0; faces.len()];
     let obj = write::obj(vertices, faces, &labels, |_| "all".to_owned(), "none.mtl");
     let ply = write::ply(vertices, faces, &vec![[0; 3]; faces.len()], &labels);
-    let glb = write::glb("g", vertices, faces, &labels, |_| {
+    let glb = write::glb("g", vertices, faces, &labels, None, |_| {
         ("all".to_owned(), [0; 3])
     });
     let mut stl = vec![0; 80];
@@ -282,7 +282,7 @@ fn a_made_shape_reads_the_same_in_every_format() {
     let text = write::obj(vertices, faces, &labels, |l| format!("label_{l}"), "m.mtl");
     assert_eq!(parse(text.as_bytes(), Format::Obj).unwrap(), off);
     assert_eq!(labels_of_obj(&text), labels);
-    let glb = write::glb("chair", vertices, faces, &labels, |l| {
+    let glb = write::glb("chair", vertices, faces, &labels, None, |l| {
         (format!("label_{l}"), [0; 3])
     });
     let found = parse(&glb, Format::Gltf).unwrap();
@@ -398,5 +398,236 @@ fn a_file_that_is_no_mesh_is_named_whatever_its_suffix_says() {
             };
             assert!(why.message.contains(what), "{}", why.message);
         }
+    }
+}
+
+/// A box as OBJ, whose vertices come after `n` others.
+fn box_obj(low: [f64; 3], high: [f64; 3], n: usize) -> String {
+    let mut text = String::new();
+    for i in 0..8 {
+        let p: [f64; 3] = std::array::from_fn(|k| if i >> k & 1 == 1 { high[k] } else { low[k] });
+        text.push_str(&format!("v {} {} {}\n", p[0], p[1], p[2]));
+    }
+    for quad in [
+        [1, 3, 4, 2],
+        [5, 6, 8, 7],
+        [1, 2, 6, 5],
+        [3, 7, 8, 4],
+        [1, 5, 7, 3],
+        [2, 4, 8, 6],
+    ] {
+        let corners: Vec<String> = quad.iter().map(|v| (n + v).to_string()).collect();
+        text.push_str(&format!("f {}\n", corners.join(" ")));
+    }
+    text
+}
+
+#[test]
+fn exports_say_which_way_is_up() {
+    let home = Home::new();
+    let mesh = home.path("box.obj");
+    std::fs::write(&mesh, box_obj([0.0; 3], [1.0, 2.0, 5.0], 0)).unwrap();
+    let mesh = mesh.display().to_string();
+    let _daemon = home.start();
+    let out = home.path("out");
+    let directory = out.display().to_string();
+    for (up, axis, turned) in [
+        ("+z", "Z", true),
+        ("+y", "Y", false),
+        ("unknown", "", false),
+    ] {
+        let name = format!("up{axis}");
+        let add = [
+            "add",
+            &mesh,
+            "--collection",
+            &name,
+            "--parts",
+            "2",
+            "--up",
+            up,
+        ];
+        stdout(&home.coseg(&add), 0);
+        for format in ["glb", "usda"] {
+            let export = [
+                "export",
+                "--collection",
+                &name,
+                "--format",
+                format,
+                "--out",
+                &directory,
+            ];
+            stdout(&home.coseg(&export), 0);
+        }
+        let usda = String::from_utf8(read(out.join("box.usda"))).unwrap();
+        assert_eq!(
+            usda.contains(&format!("upAxis = \"{axis}\"")),
+            !axis.is_empty(),
+            "{usda}"
+        );
+        assert!(usda.contains("metersPerUnit = 1"));
+        let found = parse(&read(out.join("box.glb")), Format::Gltf).unwrap();
+        let highest = found.vertices.iter().map(|v| v[1]).fold(0.0, f64::max);
+        let expected = if turned { 5.0 } else { 2.0 };
+        assert!((highest - expected).abs() < 1e-6, "{up}: {highest}");
+    }
+}
+
+#[test]
+fn a_full_description_counts_its_virtual_edges() {
+    let home = Home::new();
+    let mesh = home.path("boxes.obj");
+    let text = box_obj([0.0; 3], [1.0; 3], 0) + &box_obj([3.0, 0.0, 0.0], [4.0, 1.0, 1.0], 8);
+    std::fs::write(&mesh, text).unwrap();
+    let mesh = mesh.display().to_string();
+    let full = [
+        "describe",
+        &mesh,
+        "--full",
+        "--operator",
+        "cotan",
+        "--k",
+        "4",
+    ];
+    let found = json(&home.coseg(&[&full[..], &["--json"]].concat()), 0);
+    assert!(
+        found["report"]["n_bridges"].as_u64().unwrap() > 0,
+        "{found}"
+    );
+    let eigenvalues: Vec<f64> = serde_json::from_value(found["eigenvalues"].clone()).unwrap();
+    assert!(eigenvalues[1] > 0.0, "they are one domain: {eigenvalues:?}");
+    let text = stdout(&home.coseg(&full), 0);
+    assert!(
+        text.contains("mesh: 2 components, 3 virtual edges between components"),
+        "{text}"
+    );
+}
+
+#[test]
+fn a_gltf_is_packed_with_the_buffers_beside_it() {
+    let home = Home::new();
+    let folder = home.path("scene");
+    std::fs::create_dir(&folder).unwrap();
+    let mesh = parse(skittle(1).as_bytes(), Format::Off).unwrap();
+    let coordinates = mesh.vertices.iter().flatten();
+    let mut bytes: Vec<u8> = coordinates
+        .flat_map(|x| (*x as f32).to_le_bytes())
+        .collect();
+    let n_positions = bytes.len();
+    bytes.extend(
+        mesh.triangles
+            .iter()
+            .flatten()
+            .flat_map(|v| v.to_le_bytes()),
+    );
+    let gltf = serde_json::json!({
+        "asset": { "version": "2.0" }, "scenes": [{ "nodes": [0] }], "nodes": [{ "mesh": 0 }],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 }, "indices": 1 }] }],
+        "accessors": [
+            { "bufferView": 0, "componentType": 5126, "count": mesh.vertices.len(), "type": "VEC3" },
+            { "bufferView": 1, "componentType": 5125, "count": 3 * mesh.triangles.len(), "type": "SCALAR" },
+        ],
+        "bufferViews": [
+            { "buffer": 0, "byteLength": n_positions },
+            { "buffer": 0, "byteOffset": n_positions, "byteLength": bytes.len() - n_positions },
+        ],
+        "buffers": [{ "byteLength": bytes.len(), "uri": "a%20skittle.bin" }],
+    });
+    let path = folder.join("skittle.gltf");
+    std::fs::write(&path, gltf.to_string()).unwrap();
+    let [path, folder_name] = [&path, &folder].map(|p| p.display().to_string());
+    let _daemon = home.start();
+    let missing = json(&home.coseg(&["add", &path, "--parts", "2", "--json"]), 1);
+    let why = missing["shapes"][0]["error"]["message"].as_str().unwrap();
+    assert!(
+        why.ends_with("buffer 0 is in \"a%20skittle.bin\", but the folder of the file has no file of that name"),
+        "{why}"
+    );
+    std::fs::write(folder.join("a skittle.bin"), bytes).unwrap();
+    // The buffer is no mesh file of the folder, and nothing is said of it.
+    let output = home.coseg(&["add", &folder_name, "--parts", "2"]);
+    stdout(&output, 0);
+    assert!(!String::from_utf8_lossy(&output.stderr).contains("skipped"));
+    assert_eq!(
+        stdout(&home.coseg(&["labels", "skittle"]), 0)
+            .lines()
+            .count(),
+        SKITTLE_FACES
+    );
+    let described = json(&home.coseg(&["describe", &path, "--json"]), 0);
+    assert_eq!(described["report"]["n_polygons"], SKITTLE_FACES);
+}
+
+/// The labels of an inner wall are those of the wall around it, and the wall takes no part in what is found.
+#[test]
+fn an_inner_wall_has_the_labels_of_the_one_around_it() {
+    let options = synth::Options {
+        n_faces: 2_000,
+        rotate: false,
+    };
+    let (_other, single) = library();
+    let (_folder, library) = library();
+    for (i, shape) in synth::family(synth::Family::Chair, 3, 1, &options)
+        .iter()
+        .enumerate()
+    {
+        let (outer, name) = (&shape.mesh, format!("chair {i}"));
+        add(&single, &name, write::off(outer).into_bytes(), Format::Off).unwrap();
+        let mut normals = vec![[0.0; 3]; outer.vertices.len()];
+        for face in &outer.faces {
+            let [a, b, c] = face.map(|v| outer.vertices[v as usize]);
+            let side = |p: [f64; 3]| -> [f64; 3] { std::array::from_fn(|k| p[k] - a[k]) };
+            let (u, v) = (side(b), side(c));
+            let normal = [
+                u[1] * v[2] - u[2] * v[1],
+                u[2] * v[0] - u[0] * v[2],
+                u[0] * v[1] - u[1] * v[0],
+            ];
+            for v in face {
+                let sum = &mut normals[*v as usize];
+                *sum = std::array::from_fn(|k| sum[k] + normal[k]);
+            }
+        }
+        let mut walls = outer.clone();
+        for (p, n) in outer.vertices.iter().zip(&normals) {
+            let length = n.iter().map(|x| x * x).sum::<f64>().sqrt();
+            walls
+                .vertices
+                .push(std::array::from_fn(|k| p[k] - 2e-3 * n[k] / length));
+        }
+        let n = outer.vertices.len() as u32;
+        walls
+            .faces
+            .extend(outer.faces.iter().map(|[a, b, c]| [a + n, c + n, b + n]));
+        add(
+            &library,
+            &name,
+            write::off(&walls).into_bytes(),
+            Format::Off,
+        )
+        .unwrap();
+    }
+    for i in 0..3 {
+        let name = format!("chair {i}");
+        let report = library.shape("all", &name).unwrap().report;
+        assert_eq!((report.n_components, report.n_inner_walls), (2, 1));
+        assert_eq!(2 * report.n_inner_triangles, report.n_triangles);
+        let labels = library.labels("all", &name, None).unwrap().labels;
+        let (outer, inner) = labels.split_at(labels.len() / 2);
+        let same = outer.iter().zip(inner).filter(|(a, b)| a == b).count();
+        assert!(
+            same as f64 > 0.97 * outer.len() as f64,
+            "{same} of {}",
+            outer.len()
+        );
+        // The outer wall has the labels it has alone, but for what rounding does at boundaries.
+        let alone = single.labels("all", &name, None).unwrap().labels;
+        let same = outer.iter().zip(&alone).filter(|(a, b)| a == b).count();
+        assert!(
+            same as f64 > 0.97 * alone.len() as f64,
+            "{same} of {}",
+            alone.len()
+        );
     }
 }

@@ -1,9 +1,9 @@
 /** Values become frames and frames become values; nothing here touches a socket. */
 
-import { readFile } from "node:fs/promises";
 import { extname } from "node:path";
 import { create, type Message } from "@bufbuild/protobuf";
 import { BadMesh, BadReply } from "./errors.js";
+import { readMesh } from "./gltf.js";
 import { ArrayRefSchema, BytesRefSchema, DataType, type ArrayRef, type BytesRef } from "./gen/coseg/v1/array_pb.js";
 import { ArrayMeshSchema, EncodedMeshSchema, MeshFormat, ShapeInputSchema, type ShapeInput } from "./gen/coseg/v1/job_pb.js";
 
@@ -127,7 +127,7 @@ export function formatName(format: MeshFormat): string {
 /** A shape to add; its bytes go to `writer`. Throws {@link BadMesh} or what reading the file throws. */
 export async function shapeInput(name: string, mesh: Mesh, replace: boolean, writer: FrameWriter): Promise<ShapeInput> {
   const shape = create(ShapeInputSchema, { name, replace });
-  if (typeof mesh === "string") mesh = { format: extname(mesh).slice(1), data: await readFile(mesh) };
+  if (typeof mesh === "string") mesh = { format: extname(mesh).slice(1), data: await readMesh(mesh) };
   if ("data" in mesh) {
     const format = meshFormat(mesh.format);
     shape.source = {

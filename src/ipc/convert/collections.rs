@@ -18,6 +18,20 @@ fn up_to_wire(up: Up) -> wire::Up {
     }
 }
 
+/// Which way is up.
+pub fn up_from_wire(up: wire::Up) -> Up {
+    match up {
+        wire::Up::PlusX => Up::PlusX,
+        wire::Up::MinusX => Up::MinusX,
+        wire::Up::PlusY => Up::PlusY,
+        wire::Up::MinusY => Up::MinusY,
+        wire::Up::PlusZ => Up::PlusZ,
+        wire::Up::MinusZ => Up::MinusZ,
+        wire::Up::Unspecified | wire::Up::Unknown => Up::Unknown,
+        wire::Up::Auto => Up::Auto,
+    }
+}
+
 fn operator_to_wire(operator: Operator) -> wire::Operator {
     match operator {
         Operator::Tufted => wire::Operator::Tufted,
@@ -34,17 +48,7 @@ fn unknown_value(field: &str, value: i32) -> wire::Error {
 /// An up axis, if it is given.
 fn up_of(value: i32, field: &str) -> Result<Option<Up>, wire::Error> {
     let up = wire::Up::try_from(value).map_err(|_| unknown_value(field, value))?;
-    Ok(Some(match up {
-        wire::Up::Unspecified => return Ok(None),
-        wire::Up::PlusX => Up::PlusX,
-        wire::Up::MinusX => Up::MinusX,
-        wire::Up::PlusY => Up::PlusY,
-        wire::Up::MinusY => Up::MinusY,
-        wire::Up::PlusZ => Up::PlusZ,
-        wire::Up::MinusZ => Up::MinusZ,
-        wire::Up::Unknown => Up::Unknown,
-        wire::Up::Auto => Up::Auto,
-    }))
+    Ok((up != wire::Up::Unspecified).then(|| up_from_wire(up)))
 }
 
 /// The up axis that a collection is to have.

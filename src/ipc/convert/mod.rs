@@ -15,7 +15,7 @@ pub use analysis::{
 };
 pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
 pub use collections::{
-    collection, collection_differs, collection_spec, label_info, new_up, updated,
+    collection, collection_differs, collection_spec, label_info, new_up, up_from_wire, updated,
 };
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{

@@ -28,6 +28,8 @@ pub fn clean_report(r: &CleanReport) -> wire::CleanReport {
         n_nonsimple_polygons: r.n_nonsimple_polygons as u64,
         n_tolerated_statements: r.n_tolerated_statements as u64,
         n_unread_statements: r.n_unread_statements as u64,
+        n_inner_walls: r.n_inner_walls as u64,
+        n_inner_triangles: r.n_inner_triangles as u64,
     }
 }
 

@@ -284,7 +284,8 @@ function meshText(shape) {
   const found = [
     [r.n_components > 1 && r.n_components, "components"], [r.n_welded_vertices, "vertices welded"],
     [r.n_degenerate_triangles, "degenerate triangles dropped"], [r.n_duplicate_triangles, "duplicate triangles dropped"],
-    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"], [r.n_bridges, "virtual edges"],
+    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"],
+     [r.n_inner_walls, "inner walls left to those around them"], [r.n_bridges, "virtual edges"],
     [r.n_concave_polygons, "concave polygons"], [r.n_nonplanar_polygons, "polygons not planar"],
     [r.n_nonsimple_polygons, "polygons that cross themselves or have no area"],
     [r.n_tolerated_statements, "statements that programs differ about read"], [r.n_unread_statements, "other statements not read"],

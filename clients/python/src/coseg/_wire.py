@@ -13,6 +13,7 @@ from google.protobuf.message import Message
 from numpy.typing import ArrayLike, NDArray
 
 from coseg import types as t
+from coseg._gltf import read_mesh
 from coseg._link import Frame
 from coseg.errors import BadMesh, BadReply, Refused
 from coseg.v1 import (
@@ -87,7 +88,7 @@ def shape_input(name: str, mesh: Mesh, replace: bool, writer: FrameWriter) -> jo
     shape = job_pb2.ShapeInput(name=name, replace=replace)
     if isinstance(mesh, str | os.PathLike):
         path = Path(mesh)
-        mesh = t.Encoded(path.suffix.removeprefix(".").lower(), path.read_bytes())
+        mesh = t.Encoded(path.suffix.removeprefix(".").lower(), read_mesh(path))
     if isinstance(mesh, t.Encoded):
         shape.encoded.format = mesh_format(mesh.format)
         shape.encoded.bytes.CopyFrom(writer.file(mesh.data))

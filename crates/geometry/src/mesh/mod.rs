@@ -16,6 +16,7 @@ mod polygon;
 mod proxy;
 mod refine;
 mod report;
+mod shells;
 mod vector;
 #[cfg(test)]
 pub(crate) mod zoo;
@@ -29,6 +30,7 @@ pub use icosphere::icosphere;
 pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, as_utf8, parse};
 pub use polygon::{PolygonKind, Triangulator};
 pub use proxy::{Proxy, proxy};
+pub use shells::outer_shells;
 pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 
 pub mod write;
@@ -194,7 +196,7 @@ pub struct CleanReport {
     pub n_proxy_faces: usize,
     /// Vertices of the proxy.
     pub n_proxy_vertices: usize,
-    /// Bridges put between components of the proxy.
+    /// Bridges put between components of what is analysed.
     pub n_bridges: usize,
     /// Polygons whose triangles are not their fan from the first corner: concave ones, and those
     /// with holes.
@@ -207,4 +209,8 @@ pub struct CleanReport {
     pub n_tolerated_statements: usize,
     /// Statements that hold geometry other than polygons, or that are unknown; they were not read.
     pub n_unread_statements: usize,
+    /// Components that are left out of the analysis: another one at a small distance stands for each.
+    pub n_inner_walls: usize,
+    /// Triangles of these.
+    pub n_inner_triangles: usize,
 }

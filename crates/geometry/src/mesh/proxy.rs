@@ -165,8 +165,8 @@ fn weld(positions: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[u32; 3]> {
     kept.iter().map(|&f| renamed[f as usize]).collect()
 }
 
-/// Drops vertices that no face uses.
-fn compact(mesh: &mut TriMesh) {
+/// Drops vertices that no face uses; returns for each vertex its new index, `u32::MAX` for one that is dropped.
+pub(super) fn compact(mesh: &mut TriMesh) -> Vec<u32> {
     let mut new = vec![u32::MAX; mesh.vertices.len()];
     let mut vertices = Vec::new();
     for v in mesh.faces.as_flattened_mut() {
@@ -178,6 +178,7 @@ fn compact(mesh: &mut TriMesh) {
         *v = *slot;
     }
     mesh.vertices = vertices;
+    new
 }
 
 /// The mesh in single precision, without the faces that vanish thereby; `None` when all do.

@@ -47,13 +47,15 @@ counts!(
     n_nonsimple_polygons,
     n_tolerated_statements,
     n_unread_statements,
+    n_inner_walls,
+    n_inner_triangles,
 );
 
 impl CleanReport {
-    /// Whether the first release read the same bytes as other triangles: it took the fan of every
-    /// polygon, and dropped words that are read now.
+    /// Whether the first release described the same bytes in another way: it took the fan of every
+    /// polygon, dropped words that are read now, and analysed inner walls with the outer ones.
     pub fn differs_from_first_release(&self) -> bool {
-        self.n_concave_polygons + self.n_tolerated_statements > 0
+        self.n_concave_polygons + self.n_tolerated_statements + self.n_inner_walls > 0
     }
 }
 

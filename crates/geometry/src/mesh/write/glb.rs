@@ -76,7 +76,21 @@ fn linear(c: u8) -> f64 {
     }
 }
 
-/// A binary glTF file of one mesh, called `name`. `material` gives the name and sRGB colour of a label.
+/// The rotation that takes a coordinate axis to +Y, which is up in glTF, as x, y, z, w.
+fn upright(up: [f64; 3]) -> [f64; 4] {
+    use std::f64::consts::FRAC_1_SQRT_2 as H;
+    match up.map(|x| x as i8) {
+        [1, 0, 0] => [0.0, 0.0, H, H],
+        [-1, 0, 0] => [0.0, 0.0, -H, H],
+        [0, -1, 0] => [1.0, 0.0, 0.0, 0.0],
+        [0, 0, 1] => [-H, 0.0, 0.0, H],
+        [0, 0, -1] => [H, 0.0, 0.0, H],
+        _ => [0.0, 0.0, 0.0, 1.0],
+    }
+}
+
+/// A binary glTF file of one mesh, called `name`. `material` gives the name and sRGB colour of a label. Where
+/// the coordinate axis `up` is not +Y a node around the mesh turns it there.
 ///
 /// # Panics
 ///
@@ -86,6 +100,7 @@ pub fn glb<P: AsRef<[u32]>>(
     vertices: &[[f64; 3]],
     polygons: &[P],
     labels: &[i32],
+    up: Option<[f64; 3]>,
     material: impl Fn(i32) -> (String, [u8; 3]),
 ) -> Vec<u8> {
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
@@ -172,6 +187,13 @@ pub fn glb<P: AsRef<[u32]>>(
         );
     }
     node.push('}');
+    if let Some(up) = up.filter(|up| *up != [0.0, 1.0, 0.0]) {
+        let [x, y, z, w] = upright(up);
+        let name = quoted(&format!("{name} upright"));
+        node = format!(
+            "{{\"name\":{name},\"rotation\":[{x:?},{y:?},{z:?},{w:?}],\"children\":[1]}},{node}"
+        );
+    }
     let mut json = String::new();
     let _ = write!(
         json,
@@ -182,11 +204,12 @@ pub fn glb<P: AsRef<[u32]>>(
         quoted(name),
         binary.len(),
     );
-    container(json, binary)
+    glb_of(json, binary)
 }
 
 /// JSON and binary chunk in one file, each padded to four bytes.
-fn container(mut json: String, binary: Vec<u8>) -> Vec<u8> {
+pub fn glb_of(mut json: String, mut binary: Vec<u8>) -> Vec<u8> {
+    binary.resize(binary.len().next_multiple_of(4), 0);
     while !json.len().is_multiple_of(4) {
         json.push(' ');
     }
@@ -207,7 +230,7 @@ fn container(mut json: String, binary: Vec<u8>) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::glb;
-    use crate::mesh::{Format, parse};
+    use crate::mesh::{Format, cross, dot, parse};
 
     fn material(label: i32) -> (String, [u8; 3]) {
         (format!("label \"{label}\""), [255, 128, 0])
@@ -222,7 +245,7 @@ mod tests {
             vec![1, 2, 3],
             vec![3, 2, 1],
         ];
-        let bytes = glb("a", &vertices, &polygons, &[7, -1, 7, 7], material);
+        let bytes = glb("a", &vertices, &polygons, &[7, -1, 7, 7], None, material);
         assert_eq!(bytes.len() % 4, 0);
         let mesh = parse(&bytes, Format::Gltf).unwrap();
         assert_eq!(mesh.vertices, vertices);
@@ -238,11 +261,31 @@ mod tests {
     }
 
     #[test]
+    fn whatever_axis_is_up_becomes_the_second() {
+        for k in 0..3 {
+            for sign in [1.0, -1.0] {
+                let mut up = [0.0; 3];
+                up[k] = sign;
+                // The axis itself, and a triangle that tells turning from mirroring.
+                let vertices = [up, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+                let bytes = glb("a", &vertices, &[[1, 2, 3]], &[0], Some(up), material);
+                let found = parse(&bytes, Format::Gltf).unwrap().vertices;
+                let close = |a: f64, b: f64| (a - b).abs() < 1e-12;
+                assert!(close(found[0][1], 1.0), "{up:?}: {:?}", found[0]);
+                let [a, b, c] = [1, 2, 3].map(|v| found[v]);
+                assert!(close(dot(a, cross(b, c)), 1.0), "{up:?} is mirrored");
+                let has_node = String::from_utf8_lossy(&bytes).contains("\"rotation\"");
+                assert_eq!(has_node, up != [0.0, 1.0, 0.0]);
+            }
+        }
+    }
+
+    #[test]
     fn digits_survive_far_from_the_origin_and_at_absurd_sizes() {
         for (offset, size) in [(500_000.125, 0.001), (0.0, 1e100), (1e-90, 1e-100)] {
             let at = |x: f64, y: f64| [offset + x * size, offset + y * size, offset];
             let vertices = [at(0.1, 0.2), at(1.3, 0.0), at(0.7, 1.1), [f64::NAN; 3]];
-            let bytes = glb("a", &vertices, &[[0, 1, 2]], &[0], material);
+            let bytes = glb("a", &vertices, &[[0, 1, 2]], &[0], None, material);
             let mesh = parse(&bytes, Format::Gltf).unwrap();
             for (found, wanted) in mesh.vertices.iter().zip(&vertices).take(3) {
                 for i in 0..3 {

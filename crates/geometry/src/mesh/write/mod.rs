@@ -6,7 +6,7 @@
 mod glb;
 mod usda;
 
-pub use glb::glb;
+pub use glb::{glb, glb_of};
 pub use usda::usda;
 
 use super::TriMesh;

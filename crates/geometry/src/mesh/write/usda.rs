@@ -27,8 +27,23 @@ fn list<T: std::fmt::Display>(out: &mut String, values: impl IntoIterator<Item =
     out.push(']');
 }
 
+/// What a stage says of its up axis, and how its root turns a mesh with another one: USD knows Y and Z.
+fn upright(up: Option<[f64; 3]>) -> (&'static str, &'static str) {
+    const Y: &str = "    upAxis = \"Y\"\n";
+    match up.map(|up| up.map(|x| x as i8)) {
+        None => ("", ""),
+        Some([0, 0, 1]) => ("    upAxis = \"Z\"\n", ""),
+        Some([1, 0, 0]) => (Y, "rotateZ = 90"),
+        Some([-1, 0, 0]) => (Y, "rotateZ = -90"),
+        Some([0, -1, 0]) => (Y, "rotateX = 180"),
+        Some([0, 0, -1]) => (Y, "rotateX = 90"),
+        Some(_) => (Y, ""),
+    }
+}
+
 /// A `.usda` file of one mesh, called `name` as far as USD allows. `material` gives the name and sRGB
-/// colour of a label. Faces keep their order; `primvars:label` has the label of each.
+/// colour of a label. Faces keep their order; `primvars:label` has the label of each. The stage has the
+/// coordinate axis `up`, if it is known, and takes a unit for a metre, as glTF does.
 ///
 /// # Panics
 ///
@@ -38,6 +53,7 @@ pub fn usda<P: AsRef<[u32]>>(
     vertices: &[[f64; 3]],
     polygons: &[P],
     labels: &[i32],
+    up: Option<[f64; 3]>,
     material: impl Fn(i32) -> (String, [u8; 3]),
 ) -> String {
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
@@ -52,9 +68,20 @@ pub fn usda<P: AsRef<[u32]>>(
         low = std::array::from_fn(|i| low[i].min(number(v[i])));
         high = std::array::from_fn(|i| high[i].max(number(v[i])));
     }
+    let (up_axis, turn) = upright(up);
     let mut out = format!(
-        "#usda 1.0\n(\n    defaultPrim = \"{root}\"\n)\n\ndef Xform \"{root}\"\n{{\n    def Mesh \"mesh\"\n    {{\n"
+        "#usda 1.0\n(\n    defaultPrim = \"{root}\"\n    metersPerUnit = 1\n{up_axis})\n\n\
+         def Xform \"{root}\"\n{{\n"
     );
+    if let Some((operation, _)) = turn.split_once(' ') {
+        append(
+            &mut out,
+            format_args!(
+                "    double xformOp:{turn}\n    uniform token[] xformOpOrder = [\"xformOp:{operation}\"]\n\n"
+            ),
+        );
+    }
+    out.push_str("    def Mesh \"mesh\"\n    {\n");
     let counts = polygons.iter().map(|p| p.as_ref().len());
     let corners = polygons.iter().flat_map(|p| p.as_ref());
     out.push_str("        float3[] extent = ");
@@ -120,7 +147,7 @@ mod tests {
         let vertices = [[0.0; 3], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1e-7]];
         let polygons = [vec![0, 1, 2, 3], vec![0, 1, 2], vec![1, 2, 3]];
         let material = |label: i32| (format!("label {label}"), [255, 0, 51]);
-        let text = usda("7 chair", &vertices, &polygons, &[2, -1, 2], material);
+        let text = usda("7 chair", &vertices, &polygons, &[2, -1, 2], None, material);
         for line in [
             "    defaultPrim = \"_7_chair\"",
             "        int[] faceVertexCounts = [4, 3, 3]",
@@ -135,5 +162,29 @@ mod tests {
             assert!(text.lines().any(|l| l == line), "{line:?} in\n{text}");
         }
         assert_eq!(text.matches('{').count(), text.matches('}').count());
+        assert!(
+            !text.contains("upAxis") && !text.contains("xformOp"),
+            "{text}"
+        );
+        for (up, lines) in [
+            (
+                [0.0, 1.0, 0.0],
+                ["    upAxis = \"Y\"", "    metersPerUnit = 1"],
+            ),
+            (
+                [0.0, 0.0, 1.0],
+                ["    upAxis = \"Z\"", "    metersPerUnit = 1"],
+            ),
+            (
+                [-1.0, 0.0, 0.0],
+                ["    upAxis = \"Y\"", "    double xformOp:rotateZ = -90"],
+            ),
+        ] {
+            let text = usda("a", &vertices, &polygons, &[2, -1, 2], Some(up), material);
+            for line in lines {
+                assert!(text.lines().any(|l| l == line), "{line:?} in\n{text}");
+            }
+            assert_eq!(text.contains("xformOpOrder"), up[0] != 0.0);
+        }
     }
 }

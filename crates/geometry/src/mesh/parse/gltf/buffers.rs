@@ -1,14 +1,14 @@
 //! Accessors of a glTF file become numbers: every range is checked before anything is read or allocated.
 
-use super::{ParseError, fault, shown};
+use super::super::{ParseError, shown};
+use super::document::{Accessor, Buffer, Document, View, Whole, named};
+use super::{compressed, fault};
 use base64::Engine as _;
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
-use gltf::accessor::sparse::IndexType;
-use gltf::accessor::util::ItemIter;
-use gltf::accessor::{DataType, Dimensions, Item};
-use gltf::buffer::{Source, View};
-use gltf::{Accessor, Document};
+use bytemuck::Pod;
+use percent_encoding::percent_decode_str;
 use std::borrow::Cow;
+use std::cell::{Cell, OnceCell};
 
 /// Standard base64, with or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
@@ -17,11 +17,19 @@ const BASE64: GeneralPurpose = GeneralPurpose::new(
 );
 
 /// The data of a file, or why it has none.
-pub(super) struct Buffers<'a>(Vec<Result<Cow<'a, [u8]>, ParseError>>);
+pub(super) struct Buffers<'a> {
+    document: &'a Document,
+    data: Vec<Result<Cow<'a, [u8]>, ParseError>>,
+    /// Views that were compressed, once they have been asked for.
+    decoded: Vec<OnceCell<Result<Vec<u8>, ParseError>>>,
+    n_decoded: Cell<usize>,
+}
 
 /// Where the entries of an accessor are: in a view from `offset` on.
 struct Range<'a> {
-    view: View<'a>,
+    view: Whole,
+    /// What names the view.
+    named: &'a str,
     offset: usize,
     count: usize,
     /// Whether entries may lie apart.
@@ -30,59 +38,60 @@ struct Range<'a> {
 
 impl<'a> Buffers<'a> {
     pub(super) fn new(document: &'a Document, binary: Option<&'a [u8]>) -> Self {
-        let data = |buffer: gltf::Buffer<'a>| {
-            let place = format_args!("buffer {}", buffer.index()).to_string();
-            let bytes = match buffer.source() {
-                Source::Bin if buffer.index() == 0 => binary.map(Cow::Borrowed),
-                Source::Bin => None,
-                Source::Uri(uri) => Some(Cow::Owned(data_uri(uri, &place)?)),
-            };
-            let bytes = bytes.ok_or_else(|| fault(&place, "has no data in the file"))?;
-            // A binary chunk may be padded beyond the buffer.
-            let declared = buffer.length();
-            if declared > bytes.len() {
-                let found = bytes.len();
-                let why = format_args!("declares {declared} bytes, but has {found}").to_string();
-                return Err(fault(&place, why));
-            }
-            Ok(match bytes {
-                Cow::Borrowed(bytes) => Cow::Borrowed(&bytes[..declared]),
-                Cow::Owned(mut bytes) => {
-                    bytes.truncate(declared);
-                    Cow::Owned(bytes)
-                }
-            })
-        };
-        Self(document.buffers().map(data).collect())
+        let buffers = document.buffers.iter().enumerate();
+        Self {
+            document,
+            data: buffers.map(|(i, buffer)| data(i, buffer, binary)).collect(),
+            decoded: document
+                .buffer_views
+                .iter()
+                .map(|_| OnceCell::new())
+                .collect(),
+            n_decoded: Cell::new(0),
+        }
+    }
+
+    /// Bytes that compressed views have become.
+    pub(super) fn n_decoded(&self) -> usize {
+        self.n_decoded.get()
+    }
+
+    /// Decodes the view of an accessor, if it is compressed: what it holds counts as part of the file.
+    pub(super) fn prepare(&self, accessor: &Accessor) {
+        if let Some(view) = accessor.buffer_view {
+            // An error is reported where the accessor is read.
+            let _ = self.view(view, "");
+        }
     }
 
     /// Positions that an accessor holds; normalised integers are in −1 to 1.
-    pub(super) fn positions(&self, accessor: &Accessor<'_>) -> Result<Vec<[f64; 3]>, ParseError> {
+    pub(super) fn positions(&self, accessor: Whole) -> Result<Vec<[f64; 3]>, ParseError> {
         let wrong = || {
             fault(
-                format_args!("accessor {}", accessor.index()),
+                format_args!("accessor {}", accessor.0),
                 "holds positions, but not as VEC3 of float, byte or short",
             )
         };
-        if accessor.dimensions() != Dimensions::Vec3 {
+        let it = &self.document.accessors[accessor.0];
+        if it.dimensions != "VEC3" {
             return Err(wrong());
         }
-        match accessor.data_type() {
-            DataType::F32 => self.points::<f32>(accessor, None),
-            DataType::I8 => self.points::<i8>(accessor, Some(127.0)),
-            DataType::U8 => self.points::<u8>(accessor, Some(255.0)),
-            DataType::I16 => self.points::<i16>(accessor, Some(32_767.0)),
-            DataType::U16 => self.points::<u16>(accessor, Some(65_535.0)),
-            DataType::U32 => Err(wrong()),
+        match component(it.component_type, || format!("accessors[{}]", accessor.0))? {
+            Component::F32 => self.points::<f32>(accessor, None),
+            Component::I8 => self.points::<i8>(accessor, Some(127.0)),
+            Component::U8 => self.points::<u8>(accessor, Some(255.0)),
+            Component::I16 => self.points::<i16>(accessor, Some(32_767.0)),
+            Component::U16 => self.points::<u16>(accessor, Some(65_535.0)),
+            Component::U32 => Err(wrong()),
         }
     }
 
-    fn points<T: Item + Copy + Into<f64>>(
+    fn points<T: Pod + Into<f64>>(
         &self,
-        accessor: &Accessor<'_>,
+        accessor: Whole,
         largest: Option<f64>,
     ) -> Result<Vec<[f64; 3]>, ParseError> {
-        let largest = largest.filter(|_| accessor.normalized());
+        let largest = largest.filter(|_| self.document.accessors[accessor.0].normalized);
         let real = |value: T| match largest {
             Some(largest) => (value.into() / largest).max(-1.0),
             None => value.into(),
@@ -92,70 +101,82 @@ impl<'a> Buffers<'a> {
     }
 
     /// Indices that an accessor holds.
-    pub(super) fn indices(&self, accessor: &Accessor<'_>) -> Result<Vec<u32>, ParseError> {
-        let scalar = accessor.dimensions() == Dimensions::Scalar;
-        match accessor.data_type() {
-            DataType::U8 if scalar => self.integers::<u8>(accessor),
-            DataType::U16 if scalar => self.integers::<u16>(accessor),
-            DataType::U32 if scalar => self.integers::<u32>(accessor),
+    pub(super) fn indices(&self, accessor: Whole) -> Result<Vec<u32>, ParseError> {
+        let it = &self.document.accessors[accessor.0];
+        let scalar = it.dimensions == "SCALAR";
+        match component(it.component_type, || format!("accessors[{}]", accessor.0))? {
+            Component::U8 if scalar => self.integers::<u8>(accessor),
+            Component::U16 if scalar => self.integers::<u16>(accessor),
+            Component::U32 if scalar => self.integers::<u32>(accessor),
             _ => Err(fault(
-                format_args!("accessor {}", accessor.index()),
+                format_args!("accessor {}", accessor.0),
                 "holds indices, but not as SCALAR of unsigned integers",
             )),
         }
     }
 
-    fn integers<T: Item + Copy + Into<u32>>(
-        &self,
-        accessor: &Accessor<'_>,
-    ) -> Result<Vec<u32>, ParseError> {
+    fn integers<T: Pod + Into<u32>>(&self, accessor: Whole) -> Result<Vec<u32>, ParseError> {
         let values = self.values::<T>(accessor)?;
         Ok(values.into_iter().map(Into::into).collect())
     }
 
     /// The entries of an accessor, with its sparse ones in their places.
-    fn values<T: Item + Copy>(&self, accessor: &Accessor<'_>) -> Result<Vec<T>, ParseError> {
-        let place = format!("accessor {}", accessor.index());
-        let mut values: Vec<T> = match accessor.view() {
+    fn values<T: Pod>(&self, accessor: Whole) -> Result<Vec<T>, ParseError> {
+        let (it, place) = (
+            &self.document.accessors[accessor.0],
+            format!("accessor {}", accessor.0),
+        );
+        let path = |rest: &str| format!("accessors[{}].{rest}", accessor.0);
+        let count = it.count.0;
+        let mut values: Vec<T> = match it.buffer_view {
             Some(view) => {
                 let range = Range {
                     view,
-                    offset: accessor.offset(),
-                    count: accessor.count(),
+                    named: &path("bufferView"),
+                    offset: it.byte_offset.0,
+                    count,
                     strides: true,
                 };
-                self.entries(range, &place)?.collect()
+                self.entries(&range, &place)?
             }
             // All zeros; the caller has bounded their number.
-            None => vec![T::zero(); accessor.count()],
+            None => vec![T::zeroed(); count],
         };
-        let Some(sparse) = accessor.sparse() else {
+        let Some(sparse) = &it.sparse else {
             return Ok(values);
         };
         let n = values.len();
-        if sparse.count() > n {
-            let why = format!("replaces {} entries, but has {n}", sparse.count());
+        if sparse.count.0 > n {
+            let why = format!("replaces {} entries, but has {n}", sparse.count.0);
             return Err(fault(place, why));
         }
-        let (at, replacements) = (sparse.indices(), sparse.values());
         let at = Range {
-            view: at.view(),
-            offset: at.offset(),
-            count: sparse.count(),
+            view: sparse.indices.buffer_view,
+            named: &path("sparse.indices.bufferView"),
+            offset: sparse.indices.byte_offset.0,
+            count: sparse.count.0,
             strides: false,
         };
-        let at: Vec<u32> = match sparse.indices().index_type() {
-            IndexType::U8 => self.entries::<u8>(at, &place)?.map(u32::from).collect(),
-            IndexType::U16 => self.entries::<u16>(at, &place)?.map(u32::from).collect(),
-            IndexType::U32 => self.entries::<u32>(at, &place)?.collect(),
+        let code = sparse.indices.component_type;
+        let at: Vec<u32> = match component(code, || path("sparse.indices"))? {
+            Component::U8 => widened(self.entries::<u8>(&at, &place)?),
+            Component::U16 => widened(self.entries::<u16>(&at, &place)?),
+            Component::U32 => self.entries::<u32>(&at, &place)?,
+            _ => {
+                return Err(fault(
+                    place,
+                    "has sparse indices that are no unsigned integers",
+                ));
+            }
         };
         let replacements = Range {
-            view: replacements.view(),
-            offset: replacements.offset(),
-            count: sparse.count(),
+            view: sparse.values.buffer_view,
+            named: &path("sparse.values.bufferView"),
+            offset: sparse.values.byte_offset.0,
+            count: sparse.count.0,
             strides: false,
         };
-        for (at, value) in at.into_iter().zip(self.entries(replacements, &place)?) {
+        for (at, value) in at.into_iter().zip(self.entries(&replacements, &place)?) {
             *values
                 .get_mut(at as usize)
                 .ok_or_else(|| fault(&place, format_args!("replaces entry {at}, but has {n}")))? =
@@ -165,31 +186,15 @@ impl<'a> Buffers<'a> {
     }
 
     /// The entries of a range, all of which are there.
-    fn entries<T: Item>(
-        &self,
-        range: Range<'_>,
-        place: &str,
-    ) -> Result<ItemIter<'_, T>, ParseError> {
-        let (view, size) = (&range.view, size_of::<T>());
-        let buffer = self.0[view.buffer().index()]
-            .as_ref()
-            .map_err(Clone::clone)?;
-        let bytes = part(buffer, view.offset(), view.length()).ok_or_else(|| {
-            fault(
-                format_args!("buffer view {}", view.index()),
-                format_args!(
-                    "has {} bytes from byte {} on, but buffer {} has {}",
-                    view.length(),
-                    view.offset(),
-                    view.buffer().index(),
-                    buffer.len()
-                ),
-            )
-        })?;
-        let stride = view.stride().filter(|_| range.strides).unwrap_or(size);
+    fn entries<T: Pod>(&self, range: &Range<'_>, place: &str) -> Result<Vec<T>, ParseError> {
+        let size = size_of::<T>();
+        let (view, bytes) = self.view(range.view, range.named)?;
+        let compressed = view.compressed().map(|c| c.byte_stride);
+        let stride = view.byte_stride.or(compressed).filter(|_| range.strides);
+        let stride = stride.map_or(size, |stride| stride.0);
         if stride < size {
             return Err(fault(
-                format_args!("buffer view {}", view.index()),
+                format_args!("buffer view {}", range.view.0),
                 format_args!("has a stride of {stride} bytes, but an entry takes {size}"),
             ));
         }
@@ -197,21 +202,137 @@ impl<'a> Buffers<'a> {
             0 => Some(0),
             n => stride.checked_mul(n - 1).and_then(|b| b.checked_add(size)),
         };
-        let bytes = needed.and_then(|needed| part(bytes, range.offset, needed));
-        let bytes = bytes.ok_or_else(|| {
+        let found = needed.and_then(|needed| part(bytes, range.offset, needed));
+        let found = found.ok_or_else(|| {
             fault(
                 place,
                 format_args!(
                     "has {} entries from byte {} on, but buffer view {} has {} bytes",
                     range.count,
                     range.offset,
-                    view.index(),
-                    view.length()
+                    range.view.0,
+                    bytes.len()
                 ),
             )
         })?;
-        Ok(ItemIter::new(bytes, stride))
+        let entry = |i: usize| bytemuck::pod_read_unaligned(&found[i * stride..][..size]);
+        Ok((0..range.count).map(entry).collect())
     }
+
+    /// A view and its bytes; `named_by` is the place that names it.
+    fn view(&self, index: Whole, named_by: &str) -> Result<(&View, &[u8]), ParseError> {
+        let view = named(&self.document.buffer_views, index, "buffer view", named_by)?;
+        let place = || format!("bufferViews[{}]", index.0);
+        let stored = || self.stored(view.buffer, view.byte_offset, view.byte_length, index);
+        let Some(packed) = view.compressed() else {
+            return stored().map(|bytes| (view, bytes));
+        };
+        // A file may have what is compressed a second time as it is, for readers that do not know how.
+        if let Ok(bytes) = stored() {
+            return Ok((view, bytes));
+        }
+        let decoded = self.decoded[index.0].get_or_init(|| {
+            let bytes =
+                self.stored(packed.buffer, packed.byte_offset, packed.byte_length, index)?;
+            let decoded = compressed::decode(packed, bytes).map_err(|why| fault(place(), why))?;
+            self.n_decoded.set(self.n_decoded.get() + decoded.len());
+            Ok(decoded)
+        });
+        decoded
+            .as_deref()
+            .map(|bytes| (view, bytes))
+            .map_err(Clone::clone)
+    }
+
+    /// Bytes of a buffer that a view says it has.
+    fn stored(
+        &self,
+        buffer: Whole,
+        offset: Whole,
+        length: Whole,
+        view: Whole,
+    ) -> Result<&[u8], ParseError> {
+        let data = named(
+            &self.data,
+            buffer,
+            "buffer",
+            format_args!("bufferViews[{}].buffer", view.0),
+        )?;
+        let data = data.as_ref().map_err(Clone::clone)?;
+        part(data, offset.0, length.0).ok_or_else(|| {
+            fault(
+                format_args!("buffer view {}", view.0),
+                format_args!(
+                    "has {} bytes from byte {} on, but buffer {} has {}",
+                    length.0,
+                    offset.0,
+                    buffer.0,
+                    data.len()
+                ),
+            )
+        })
+    }
+}
+
+fn widened<T: Into<u32>>(values: Vec<T>) -> Vec<u32> {
+    values.into_iter().map(Into::into).collect()
+}
+
+/// The bytes of a buffer, as many as it declares.
+fn data<'a>(
+    index: usize,
+    buffer: &Buffer,
+    binary: Option<&'a [u8]>,
+) -> Result<Cow<'a, [u8]>, ParseError> {
+    let place = format!("buffer {index}");
+    let bytes = match &buffer.uri {
+        Some(uri) => Some(Cow::Owned(data_uri(uri, &place)?)),
+        None if index == 0 => binary.map(Cow::Borrowed),
+        None => None,
+    };
+    let bytes = bytes.ok_or_else(|| fault(&place, "has no data in the file"))?;
+    // A binary chunk may be padded beyond the buffer.
+    let declared = buffer.byte_length.0;
+    if declared > bytes.len() {
+        let found = bytes.len();
+        let why = format!("declares {declared} bytes, but has {found}");
+        return Err(fault(&place, why));
+    }
+    Ok(match bytes {
+        Cow::Borrowed(bytes) => Cow::Borrowed(&bytes[..declared]),
+        Cow::Owned(mut bytes) => {
+            bytes.truncate(declared);
+            Cow::Owned(bytes)
+        }
+    })
+}
+
+#[derive(Clone, Copy)]
+enum Component {
+    I8,
+    U8,
+    I16,
+    U16,
+    U32,
+    F32,
+}
+
+fn component(code: Whole, place: impl Fn() -> String) -> Result<Component, ParseError> {
+    Ok(match code.0 {
+        5120 => Component::I8,
+        5121 => Component::U8,
+        5122 => Component::I16,
+        5123 => Component::U16,
+        5125 => Component::U32,
+        5126 => Component::F32,
+        other => {
+            let place = format!("{}.componentType", place());
+            return Err(fault(
+                place,
+                format_args!("is {other}, which glTF does not know"),
+            ));
+        }
+    })
 }
 
 fn part(bytes: &[u8], offset: usize, length: usize) -> Option<&[u8]> {
@@ -220,14 +341,22 @@ fn part(bytes: &[u8], offset: usize, length: usize) -> Option<&[u8]> {
 
 /// The bytes of a `data:` URI; no other is followed.
 fn data_uri(uri: &str, place: &str) -> Result<Vec<u8>, ParseError> {
-    let Some(data) = uri.strip_prefix("data:") else {
+    let is_data = uri
+        .get(..5)
+        .is_some_and(|start| start.eq_ignore_ascii_case("data:"));
+    if !is_data {
         let shown = shown(uri.as_bytes());
-        let why =
-            format!("is in another file (\"{shown}\"), which is never read: export a single .glb");
+        let why = format!(
+            "is in another file (\"{shown}\"), which is not sent along: `coseg add` and the clients pack \
+             both into one when they are given the path; or export a single .glb"
+        );
         return Err(fault(place, why));
-    };
-    data.split_once(',')
-        .filter(|(kind, _)| kind.ends_with(";base64"))
-        .and_then(|(_, text)| BASE64.decode(text).ok())
-        .ok_or_else(|| fault(place, "has a data URI that is not valid base64"))
+    }
+    let wrong = || fault(place, "has a data URI that is not valid base64");
+    let (kind, text) = uri[5..].split_once(',').ok_or_else(wrong)?;
+    let plain = Cow::from(percent_decode_str(text));
+    if kind.to_ascii_lowercase().ends_with(";base64") {
+        return BASE64.decode(plain).map_err(|_| wrong());
+    }
+    Ok(plain.into_owned())
 }
