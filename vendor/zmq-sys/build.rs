@@ -5,11 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Applied in this order.
-const PATCHES: [&str; 3] = [
-    "1-connections.patch",
-    "2-drop-peer.patch",
-    "3-intake.patch",
-];
+const PATCHES: [&str; 3] = ["1-connections.patch", "2-drop-peer.patch", "3-intake.patch"];
 /// A file that the patches add.
 const ADDED: &str = "intake.hpp";
 
@@ -26,7 +22,10 @@ fn main() {
     for name in PATCHES {
         apply(&Path::new("patches").join(name), &source.join("src"));
     }
-    copy(&Path::new("patches").join(ADDED), &source.join("src").join(ADDED));
+    copy(
+        &Path::new("patches").join(ADDED),
+        &source.join("src").join(ADDED),
+    );
     compile(&source, &out.join("lib"));
 }
 
@@ -57,8 +56,8 @@ fn apply(path: &Path, directory: &Path) {
     let text = read(path);
     for part in text.split("diff --git ").skip(1) {
         let diff = &part[part.find("--- ").expect("a diff names its files")..];
-        let patch = diffy::Patch::from_str(diff)
-            .unwrap_or_else(|e| panic!("{}: {}", path.display(), e));
+        let patch =
+            diffy::Patch::from_str(diff).unwrap_or_else(|e| panic!("{}: {}", path.display(), e));
         let name = patch.modified().expect("a diff names its file");
         let file = directory.join(name.trim_start_matches("b/"));
         let patched = diffy::apply(&read(&file), &patch)
@@ -83,7 +82,11 @@ fn compile(source: &Path, library: &Path) {
         .map(|entry| entry.expect("the sources can be listed").path())
         .filter(|path| path.extension().map_or(false, |e| e == "cpp"))
         // They need GnuTLS.
-        .filter(|path| !path.file_name().map_or(false, |n| n.to_string_lossy().starts_with("wss_")))
+        .filter(|path| {
+            !path
+                .file_name()
+                .map_or(false, |n| n.to_string_lossy().starts_with("wss_"))
+        })
         .collect();
     files.sort();
     let mut build = cc::Build::new();
@@ -139,6 +142,8 @@ fn has_strlcpy() -> bool {
         .cpp(true)
         .file(&probe)
         .cargo_output(false)
+        // That it fails is an answer, not news.
+        .cargo_warnings(false)
         .try_compile("strlcpy")
         .is_ok()
 }
