@@ -321,7 +321,7 @@ mod tests {
         assert!(replies.used() > 300_000);
         // It has its share; others have nothing yet.
         assert!(!replies.has_room(&a) && replies.has_room(&b));
-        let rest = replies.take(&b, frames(700_000)).ok().unwrap();
+        let rest = replies.take(&b, frames(745_000)).ok().unwrap();
         let refused = replies.take(&a, frames(100_000)).err().unwrap();
         assert_eq!(refused[0].len(), 100_000);
         // Whoever has little is told so, however much others have.
