@@ -205,10 +205,12 @@ impl Catalog {
                 settled: at_least(old.as_ref().map(|w| w.settled)),
                 committed: at_least(old.as_ref().map(|w| w.committed)),
             };
-            witness.write(&self.path).map_err(|error| match error {
-                StoreError::NoSpace { .. } => error,
-                error => self.health.stop(error.to_string()),
-            })?;
+            if old.as_ref() != Some(&witness) {
+                witness.write(&self.path).map_err(|error| match error {
+                    StoreError::NoSpace { .. } => error,
+                    error => self.health.stop(error.to_string()),
+                })?;
+            }
         }
         Ok(copied)
     }
