@@ -233,7 +233,7 @@ pub(crate) struct InCollection {
 /// Which collection, of a command that names nothing else by its place.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct OneCollection {
-    /// The collection; may be left out if there is only one
+    /// The collection; may be left out if there is only one, or where all are meant
     #[arg(id = "COLLECTION", value_name = "COLLECTION")]
     name: Option<String>,
     /// The same
