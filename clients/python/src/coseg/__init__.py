@@ -122,7 +122,7 @@ __all__ = [
     "Suggestion",
     "Transferred",
     "Undone",
-    "Updated",
     "UpEstimate",
+    "Updated",
     "default_endpoint",
 ]

@@ -256,8 +256,8 @@ class Collection:
         return wire.collection(reply.collection)
 
     def set(self, *, up: str) -> t.Updated:
-        """Changes which way is up, such as ``"+z"``: labels are found again along the new axis, and faces that
-        were labelled by hand keep theirs. Shapes that are left to do follow in the background:
+        """Changes which way is up, such as ``"+z"``: labels are found again along the new axis, and faces
+        that were labelled by hand keep theirs. Shapes that are left to do follow in the background:
         :meth:`wait_idle`. Can be undone."""
         reply, _ = self._call("update_collection", up=wire.up_value(up))
         return wire.flat(t.Updated, reply)

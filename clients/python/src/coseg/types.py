@@ -98,8 +98,8 @@ class CollectionInfo:
     labels: tuple[Label, ...]
     #: With ``up="auto"``, once there are shapes.
     up_estimate: UpEstimate | None = None
-    #: Set if the up axis is given and at least half of the shapes stand clearly better along one other axis: that
-    #: one. The given one is probably a mistake, which ``collection.set(up=...)`` corrects.
+    #: Set if the up axis is given and at least half of the shapes stand clearly better along one other
+    #: axis: that one. The given one is probably a mistake, which ``collection.set(up=...)`` corrects.
     up_disagrees: UpEstimate | None = None
     #: Changes by a person that ``undo`` can take back.
     n_undoable: int = 0
