@@ -140,9 +140,7 @@ async fn library(server: &Server) -> Answer {
     let (reply, _) = ask!(server, ListCollections(request))?;
     let (queues, queued, at_work) = {
         let progress = server.daemon.work.progress();
-        let of = |c: &wire::Collection| {
-            progress.n_live(c.spec.as_ref().map(|s| s.name.as_str()))
-        };
+        let of = |c: &wire::Collection| progress.n_live(c.spec.as_ref().map(|s| s.name.as_str()));
         let queues: Vec<usize> = reply.collections.iter().map(of).collect();
         (queues, progress.n_live(None), progress.n_at_stages())
     };

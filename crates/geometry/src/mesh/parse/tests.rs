@@ -370,7 +370,7 @@ fn concave_faces_have_the_area_they_have_in_every_format_and_in_exports() {
         assert_eq!(polygons[1][0] as usize, 8 + start);
         let labels: Vec<i32> = (0..10).collect();
         let named = |label: i32| (format!("label_{label}"), [0; 3]);
-        let glb = write::glb("c", &mesh.vertices, &polygons, &labels, named);
+        let glb = write::glb("c", &mesh.vertices, &polygons, &labels, None, named);
         let glb = parse(&glb, Format::Gltf).unwrap();
         assert!((area(&glb) - 30.0).abs() < 1e-6, "{start}");
         assert_eq!(glb.triangles.len(), mesh.triangles.len());
