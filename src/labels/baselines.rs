@@ -1,4 +1,4 @@
-//! What others would answer on the same descriptors: the yardsticks of `coseg bench labels`.
+//! What others would answer on the same descriptors: the yardsticks of `coseg-bench labels`.
 //!
 //! All of them group the patches of all shapes at once, with k clusters, and stop there.
 

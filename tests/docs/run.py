@@ -35,7 +35,7 @@ EXCEPTIONS = {
     r"pip install \./clients/python|npm ci && .*": "clients/check.sh types it",
     r"python tests/golden/record\.py .*": "would rewrite the recorded conversations, which tests/it/golden.rs replays",
     r"python3 -m venv venv && .*scikit-sparse.*": "builds SuiteSparse's wrapper for minutes, for the next lines only",
-    r"venv/bin/python benches/spectrum\.py .*": "measures for an hour",
+    r"venv/bin/python comparisons/spectrum\.py .*": "measures for an hour",
     r"perf .*": "needs the kernel's leave to sample",
     r"coseg describe million\.off .*": "takes a minute and 3.6 GB; so does the mesh of the line before",
     r"python3 -c .*meshes\.bumpy\(1_000_000\).*": "makes the mesh of the next line, with numpy",
@@ -68,7 +68,7 @@ BEFORE = {
 PROGRAMS = {"python": "clients/python/tests/test_examples.py", "ts": "clients/typescript/test/snippets.ts"}
 #: Python that is run here, with what it is given: arguments, and names it takes as known.
 HERE = {"docs/protocol.md": "python", "docs/format.md": "python"}
-COMMAND = re.compile(r"(sudo|coseg|cargo|pip|npm|python3?|venv/\S+|perf|packaging/\S+|tests/\S+|clients/\S+|export) ")
+COMMAND = re.compile(r"(sudo|coseg|coseg-bench|cargo|pip|npm|python3?|venv/\S+|perf|packaging/\S+|tests/\S+|clients/\S+|export) ")
 
 
 def blocks(text: str) -> list[tuple[str, int, list[str]]]:
@@ -137,7 +137,7 @@ class World:
             shutil.copytree(meshes, self.home, dirs_exist_ok=True)
         (self.home / "bin").symlink_to(coseg.parent)
         (self.home / "run").mkdir(mode=0o700)
-        for folder in ("clients", "tests", "packaging", "benches", "target"):
+        for folder in ("clients", "tests", "packaging", "comparisons", "target"):
             if (ROOT / folder).exists():
                 (self.home / folder).symlink_to(ROOT / folder)
         keep = {k: v for k, v in os.environ.items() if k in ("PATH", "LANG", "RUSTUP_HOME", "VIRTUAL_ENV")}
@@ -242,7 +242,7 @@ def fixture(coseg: Path, folder: Path) -> None:
     shutil.copy(folder / "meshes" / "101.off", folder / "chair.off")
     shutil.rmtree(folder / "made")
     synth("chair", "--count", "4", "--faces", "1000", "--out", str(folder / "benchmark" / "chairs"))
-    subprocess.run([sys.executable, ROOT / "benches" / "pieces.py", folder / "pieces"], check=True)
+    subprocess.run([sys.executable, ROOT / "comparisons" / "pieces.py", folder / "pieces"], check=True)
 
 
 def run_document(world: World, document: str) -> list[str]:

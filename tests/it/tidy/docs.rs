@@ -3,8 +3,16 @@
 use std::path::Path;
 
 /// Folders whose files documents name in backquotes.
-const TOP: [&str; 8] = [
-    "src/", "docs/", "proto/", "config/", "systemd/", "tests/", "benches/", ".ci/",
+const TOP: [&str; 9] = [
+    "src/",
+    "crates/",
+    "docs/",
+    "proto/",
+    "config/",
+    "systemd/",
+    "tests/",
+    "comparisons/",
+    ".ci/",
 ];
 
 /// Links of a document, and paths named in a document or a source, that lead nowhere.

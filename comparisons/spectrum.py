@@ -1,8 +1,8 @@
 """Times `coseg describe --full` against scipy's eigsh on identical matrices, and prints Markdown.
 
-    python benches/spectrum.py --sizes 2500 10000 --k 100 300         synthetic meshes
-    python benches/spectrum.py --mesh ant.off teddy.off --k 100 300   real ones
-    python benches/spectrum.py --tree meshes/ --k 300 --sample 20     all of a folder, a sample against scipy
+    python comparisons/spectrum.py --sizes 2500 10000 --k 100 300         synthetic meshes
+    python comparisons/spectrum.py --mesh ant.off teddy.off --k 100 300   real ones
+    python comparisons/spectrum.py --tree meshes/ --k 300 --sample 20     all of a folder, a sample against scipy
 
 Peers are scipy.sparse.linalg.eigsh at sigma = -0.01, mode shift and invert, with SuperLU (what scipy does by
 itself) and with CHOLMOD (scikit-sparse, if it is installed). Everything runs in turn in processes of its

@@ -1,10 +1,10 @@
 """Times a map between points against pyFM's fit and ZoomOut in one run, in turn, and prints Markdown.
 
-    python benches/maps.py --meshes DIR [--rounds 3]
+    python comparisons/maps.py --meshes DIR [--rounds 3]
 
 DIR has pyFM's example: cat-00.off, lion-00.off, and lion2cat, which has for each vertex of the lion one of the cat. pyFM is
 pyfmaps 1.3.1 from the Python package index. Both get spectra for nothing, and both use one thread. Of pyFM two spans are
-printed: descriptors, fit and ZoomOut from 30 to 100 in steps of 5; and without descriptors. Of coseg, `coseg bench maps`
+printed: descriptors, fit and ZoomOut from 30 to 100 in steps of 5; and without descriptors. Of coseg, `coseg-bench maps`
 times from samples and probe functions to the dense map of size 100 with its quality; what is computed once a shape for
 all its maps is printed beside it. Errors are mean distances on the cat, divided by the square root of its area: by edges
 for both.
@@ -34,7 +34,7 @@ def arguments():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", required=True, help="folder with cat-00.off, lion-00.off and lion2cat")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--coseg", default="target/release/coseg")
+    parser.add_argument("--bench", default="target/release/coseg-bench")
     return parser.parse_args()
 
 
@@ -68,7 +68,7 @@ def pyfm(meshes):
 def ours(args):
     """Milliseconds and error of one map."""
     files = [f"{args.meshes}/{name}" for name in ("cat-00.off", "lion-00.off", "lion2cat")]
-    command = [args.coseg, "bench", "maps", "--json", "--pair", *files]
+    command = [args.bench, "maps", "--json", "--pair", *files]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         sys.exit(f"{' '.join(command)}: {done.stderr}")

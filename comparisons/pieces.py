@@ -1,7 +1,7 @@
-"""Shapes of many loose pieces with known parts, for `coseg bench labels`: chairs of 14 boards, cars of 50 pieces.
+"""Shapes of many loose pieces with known parts, for `coseg-bench labels`: chairs of 14 boards, cars of 50 pieces.
 
-    python3 benches/pieces.py pieces                       # pieces/chairs, pieces/cars; standard library only
-    coseg bench labels --data pieces --up +y
+    python3 comparisons/pieces.py pieces                       # pieces/chairs, pieces/cars; standard library only
+    coseg-bench labels --data pieces --up +y
 
 No two pieces share a vertex; they touch or overlap, as in assets that were assembled and never united.
 """
