@@ -89,7 +89,8 @@ impl Library {
     /// There is none of the name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
-        let known = self.collection_row(name).map(|row| row.id);
+        // Stays empty where the request is repeated: another collection may have the name by then.
+        let mut deleted = None;
         self.once(key, request, |tx| {
             let row = tx.collection(name)?;
             let row = row.ok_or_else(|| LibraryError::NotFound {
@@ -98,9 +99,10 @@ impl Library {
             })?;
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
+            deleted = Some(row.id);
             Ok(Vec::new())
         })?;
-        if let Ok(id) = known {
+        if let Some(id) = deleted {
             // Ids are not used again. Who is at its lane still has it, and finds no collection.
             let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
             lanes.remove(&id);
