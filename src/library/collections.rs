@@ -90,15 +90,17 @@ impl Library {
     /// There is none of the name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Digest::of(format!("delete {name:?}").as_bytes());
+        // Stays empty where the request is repeated: another collection may have the name by then.
+        let deleted = std::cell::Cell::new(None);
         let delete = |tx: &Tx<'_>| {
             let row = super::read::require_collection(tx, name)?;
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
+            deleted.set(Some(row.id));
             Ok(Vec::new())
         };
-        let known = self.collection_row(name).map(|row| row.id);
         self.store.freeing(|| self.once(key, request, delete))?;
-        if let Ok(id) = known {
+        if let Some(id) = deleted.take() {
             // Ids are not used again. Who is at its lane still has it, and finds no collection.
             let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
             lanes.remove(&id);

@@ -158,7 +158,7 @@ fn round(daemon: &Daemon, client: &mut Client, n: u64) -> u64 {
 
 #[test]
 fn memory_is_flat_over_operations() {
-    let n = number("COSEG_TEST_OPERATIONS", 600);
+    let n = number("COSEG_TEST_OPERATIONS", 600).max(10 * ROUND);
     let home = Home::new();
     let daemon = home.start();
     let client = &mut daemon.client();
@@ -171,7 +171,7 @@ fn memory_is_flat_over_operations() {
     add(client, "w", &[("x", &wedge(0))]);
     wait_idle(client, "c");
     // Caches fill to their bounds.
-    let warm = (n / ROUND / 2).min(100);
+    let warm = (n / ROUND / 2).clamp(10, 100);
     let mut least = (0..warm)
         .map(|i| round(&daemon, client, i + 1))
         .collect::<Vec<_>>();
@@ -193,7 +193,14 @@ fn large(home: &Home, faces: u32) -> Vec<String> {
     let out = home.path("large");
     let (faces, folder) = (faces.to_string(), out.display().to_string());
     let args = [
-        "synth", "chair", "--count", "4", "--faces", &faces, "--out", &folder,
+        "synth",
+        "chair",
+        "--count",
+        "4",
+        "--faces",
+        faces.as_str(),
+        "--out",
+        folder.as_str(),
     ];
     stdout(&home.coseg(&args), 0);
     let files = std::fs::read_dir(&out).unwrap().map(|e| e.unwrap().path());
