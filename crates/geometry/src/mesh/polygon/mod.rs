@@ -119,8 +119,7 @@ impl Triangulator {
             normal = std::array::from_fn(|i| normal[i] + part[i]);
         }
         let doubled = norm(normal);
-        // Written so that a NaN has no plane.
-        if !(doubled > MIN_AREA) {
+        if doubled.is_nan() || doubled <= MIN_AREA {
             return None;
         }
         let normal = normal.map(|x| x / doubled);
@@ -297,8 +296,8 @@ fn points(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<(Plane, Vec<FixedVert
 type Passes = HashMap<(usize, usize), i32>;
 
 /// The plane with the polygon's edges in it, and how often each is passed; `None` if two of them
-/// cross, or if a corner that lies on an edge in the plane does not do so in space, where `place`
-/// says it is.
+/// cross, or if a corner that lies on an edge in the plane does not do so in space, where
+/// `local` has it.
 fn edges(
     mut plane: Plane,
     ring: &[FixedVertexHandle],
