@@ -99,7 +99,12 @@ impl Library {
             return Ok(Turned { state, labels });
         }
         if let Some(teaching) = &lane.state.teaching {
-            let again = self.relearnt(lane, teaching)?;
+            let mut again = self.relearnt(lane, teaching)?;
+            if let Some(again) = again.as_mut().filter(|t| t.closed) {
+                // What was discovered along the old axis is believed no longer: persons' labels are all there are.
+                again.discovered.clear();
+                again.discovered_labels.clear();
+            }
             let labels = match again.is_some() {
                 true => NewLabelling::FromPersons,
                 false => NewLabelling::Same,

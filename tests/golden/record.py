@@ -350,6 +350,8 @@ def plain(r: Recorder) -> None:
     r.say("split_label", "two of one", split_label={**of, "label": 7})
     r.say("undo", "the split is taken back", undo=of)
     r.say("wait_idle_after_undo", "the other shape has followed", wait_idle={**of, "wait_ms": 20000})
+    r.say("update_collection", "another up axis", update_collection={**of, "up": "UP_PLUS_Z"})
+    r.say("wait_idle_after_up", "all shapes have followed", wait_idle={**of, "wait_ms": 20000})
 
     r.say("error_malformed_message", "the header is no Request", raw=b"\xff\xff\xff")
     r.say("error_unknown_request", "a body that this version does not know", raw=b"\x0a\x05later\xba\x3e\x00")

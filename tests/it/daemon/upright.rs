@@ -9,7 +9,7 @@ use coseg::synth::{Family, Options, family};
 use rustix::process::Signal;
 
 const FEW_FACES: Options = Options {
-    n_faces: 600,
+    n_faces: 1_000,
     rotate: false,
 };
 
