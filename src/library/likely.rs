@@ -1,5 +1,6 @@
 //! What was probably meant by a name that nothing has.
 
+use std::cmp::Reverse;
 use strsim::osa_distance;
 
 /// Longest names that are compared, in characters: what is compared costs the product of the
@@ -23,9 +24,12 @@ pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Op
             return None;
         }
         let distance = osa_distance(&wanted, &folded);
-        (distance <= slips).then_some((distance, candidate))
+        // Of names as near, the one that begins the same: `chair-1` meant `chair-001`, not `chairs`.
+        let begins = wanted.chars().zip(folded.chars());
+        let n_same = begins.take_while(|(a, b)| a == b).count();
+        (distance <= slips).then_some(((distance, Reverse(n_same)), candidate))
     });
-    near.min_by_key(|(distance, _)| *distance)
+    near.min_by_key(|(rank, _)| *rank)
         .map(|(_, candidate)| candidate)
 }
 

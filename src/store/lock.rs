@@ -104,8 +104,9 @@ impl Holder {
 
     fn parse(text: &str) -> Self {
         let mut lines = text.lines().map(str::trim);
+        let pid = lines.next().and_then(|l| l.parse().ok());
         Self {
-            pid: lines.next().and_then(|l| Pid::from_raw(l.parse().ok()?)),
+            pid: pid.filter(|pid| *pid > 0).and_then(Pid::from_raw),
             endpoint: lines.next().filter(|l| !l.is_empty()).map(str::to_owned),
         }
     }

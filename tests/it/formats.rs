@@ -568,7 +568,7 @@ fn an_inner_wall_has_the_labels_of_the_one_around_it() {
     };
     let (_other, single) = library();
     let (_folder, library) = library();
-    for (i, shape) in synth::family(synth::Family::Chair, 3, 1, &options)
+    for (i, shape) in synth::family(synth::Family::Chair, 3, 3, &options)
         .iter()
         .enumerate()
     {

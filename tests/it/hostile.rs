@@ -234,7 +234,16 @@ pub(crate) fn corpus() -> Vec<Hostile> {
     let knot = |i| circle(i * 7919 % 10_000, 1.0);
     flat("a knot", &corners.clone().map(knot).collect::<Vec<_>>());
     // Teeth of all lengths cross nearly all edges of the triangulation: the square of their number.
-    let comb = |i: usize| [i as f64, if i.is_multiple_of(2) { 0.0 } else { 1.0 + i as f64 }];
+    let comb = |i: usize| {
+        [
+            i as f64,
+            if i.is_multiple_of(2) {
+                0.0
+            } else {
+                1.0 + i as f64
+            },
+        ]
+    };
     flat(
         "a comb",
         &corners.clone().take(2_000).map(comb).collect::<Vec<_>>(),

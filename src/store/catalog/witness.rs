@@ -268,9 +268,14 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
 /// What the catalog says, log included; `None` if that cannot be read for damage.
 fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let read = Connection::open_with_flags(catalog, flags)
-        .map_err(StoreError::from)
-        .and_then(|connection| said_by(&connection));
+    let has_log = std::fs::metadata(super::log_of(catalog)).is_ok_and(|log| log.len() > 0);
+    // SQLite would make a log where there is none.
+    let read = match has_log {
+        true => Connection::open_with_flags(catalog, flags)
+            .map_err(StoreError::from)
+            .and_then(|connection| said_by(&connection)),
+        false => said_by_file_alone(catalog),
+    };
     match read {
         Ok(said) => Ok(Some(said)),
         Err(e) if e.is_damage() => Ok(None),

@@ -12,7 +12,7 @@ fn a_folder_with_bad_and_double_names_adds_the_rest() {
     let within = |name: &str| home.path("meshes").join(name);
     std::fs::write(within("a\nb.off"), skittle(3)).unwrap();
     std::fs::write(within("c\td.off"), skittle(4)).unwrap();
-    std::fs::write(within("9.obj"), "v 0 0 0\n").unwrap();
+    std::fs::write(within("9.stl"), "solid\n").unwrap();
     let output = home.coseg(&["add", &folder, "-c", "c", "--parts", "2", "--json"]);
     let added = json(&output, 1);
     assert_eq!(

@@ -1,7 +1,6 @@
 //! Clients that take what is nobody's: that never read, never finish a message, subscribe without end, or connect
 //! without end. The daemon's memory stays bounded, and whoever behaves is served meanwhile.
 
-use super::create;
 use crate::harness::{Daemon, Home, add, skittle};
 use coseg::call;
 use coseg::ipc::client::Client;
@@ -195,11 +194,10 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     let mut daemon = home.start_with(&[], &SMALL);
     let path = home.endpoint().strip_prefix("ipc://").unwrap().to_owned();
     let mut client = daemon.client();
-    create(&mut client, "c");
     let mesh = skittle(0);
     // Its comment is what is stored and sent; it does not compress.
     let mut state = 1_u64;
-    let noise = (0..8 << 20).map(|_| {
+    let noise = (0..4 << 20).map(|_| {
         state = state
             .wrapping_mul(6_364_136_223_846_793_005)
             .wrapping_add(1);
@@ -265,8 +263,7 @@ fn a_slow_reader_gets_all_that_it_asked_for() {
     let home = Home::new();
     let daemon = home.start_with(&[], &SMALL);
     let mut client = daemon.client();
-    create(&mut client, "c");
-    let large = skittle(0).replacen('\n', &format!("\n#{}\n", "x".repeat(6 << 20)), 1);
+    let large = skittle(0).replacen('\n', &format!("\n#{}\n", "x".repeat(5 << 20)), 1);
     add(&mut client, "c", &[("large", &large)]);
     let socket = super::raw(zmq::DEALER, &home.endpoint());
     let n = 24;
@@ -309,7 +306,6 @@ fn ten_thousand_connections_leave_a_good_client_served() {
         daemon.endpoint = bound.split(' ').next().unwrap().to_owned();
         let endpoint = daemon.endpoint.clone();
         let mut client = daemon.client();
-        create(&mut client, "c");
         add(&mut client, "c", &[("a", &skittle(0))]);
         let (alone, ()) = beside(&daemon, || ());
         // More at a time than the daemon may have files.

@@ -1,6 +1,6 @@
 //! Files that requests name by path.
 
-use super::{create, raw};
+use super::{create, create_with, raw};
 use crate::harness::{Home, add, skittle};
 use coseg::call;
 use coseg::ipc::client::ClientError;
@@ -77,7 +77,7 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
     let roots = allowed.display().to_string();
     let daemon = home.start_with(&[], &[("COSEG__INGEST__PATHS", &roots)]);
     let client = &mut daemon.client();
-    create(client, "c");
+    create_with(client, "c", 2);
     // A pipe that nobody writes into is none that anybody waits for.
     let pipe = allowed.join("pipe.off");
     let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;

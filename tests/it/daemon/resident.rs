@@ -242,7 +242,7 @@ fn healthy_meshes_cost_no_worker() {
 fn kills_and_resumed_work_cost_no_worker() {
     let n = number("COSEG_TEST_KILLS", 6);
     let home = Home::new();
-    let meshes = large(&home, 500);
+    let meshes = large(&home, 1_000);
     let mut daemon = home.start();
     add(&mut daemon.client(), "c", &[("x", &meshes[0])]);
     for i in 0..n {

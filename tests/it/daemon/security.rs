@@ -270,20 +270,20 @@ fn a_client_id_belongs_to_the_key_that_uses_it() {
             other => panic!("{other:?}"),
         }
     };
-    let first = job(&mut boss, "a", "1");
-    assert_eq!(job(&mut boss, "a", "1"), first);
+    let first = job(&mut boss, "a", "first");
+    assert_eq!(job(&mut boss, "a", "first"), first);
     // The same request of another key is another request, and so is another one.
-    let second = job(&mut feeder, "a", "1");
+    let second = job(&mut feeder, "a", "first");
     assert_ne!(second, first);
-    assert_eq!(job(&mut feeder, "a", "1"), second);
-    job(&mut feeder, "b", "2");
-    job(&mut boss, "c", "2");
+    assert_eq!(job(&mut feeder, "a", "first"), second);
+    job(&mut feeder, "b", "second");
+    job(&mut boss, "c", "second");
     // A change that is carried out elsewhere, too.
     wait_idle(&mut boss, "c");
     let remove = |client: &mut Client, shape: &str| {
         let (collection, shape) = ("c".to_owned(), shape.to_owned());
         let removing = Body::RemoveShape(wire::RemoveShapeRequest { collection, shape });
-        client.call_as("3", removing, Vec::new())
+        client.call_as("third", removing, Vec::new())
     };
     remove(&mut boss, "b").unwrap();
     remove(&mut boss, "b").unwrap();
