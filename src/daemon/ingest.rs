@@ -26,6 +26,8 @@ use std::time::{Duration, Instant};
 pub(crate) const MAX_THREADS: usize = 128;
 /// How long one file may take, unless the request's own deadline is sooner.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// How long after that deadline the file is given up: the answer is that the deadline passed.
+const AFTER_DEADLINE: Duration = Duration::from_millis(500);
 /// Between attempts to open a file that somebody has leased and was asked to give back.
 const LEASE_PACE: Duration = Duration::from_millis(20);
 
@@ -100,7 +102,8 @@ impl<'a> Files<'a> {
             return Err(busy("too many files are being read"));
         };
         let patience = Instant::now() + PATIENCE;
-        let until = self.deadline.map_or(patience, |d| d.min(patience));
+        let deadline = self.deadline.map(|d| d + AFTER_DEADLINE);
+        let until = deadline.map_or(patience, |d| d.min(patience));
         let (sender, done) = mpsc::sync_channel(1);
         let spawned = std::thread::Builder::new()
             .name("file".to_owned())

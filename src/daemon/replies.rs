@@ -131,7 +131,9 @@ impl Replies {
         let _waiting = self.wait(client);
         loop {
             let freed = self.freed.notified();
-            match self.state().room(client) {
+            // Apart: who ends a connection needs the state.
+            let room = self.state().room(client);
+            match room {
                 Room::Free => return Ok(()),
                 Room::Wait if begin.elapsed() < PATIENCE => {}
                 Room::Wait => return Err(unread()),

@@ -47,6 +47,7 @@ pub(crate) struct InHand {
 pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<Incoming>) {
     // What queues up at the gates is bounded by the permits.
     let readers = Gate::new(daemon.n_workers + EXTRA_READS);
+    let bulk = Gate::new(daemon.n_workers);
     let computing = Gate::new(daemon.n_workers);
     let keeping = Gate::new(MAX_KEEPING);
     let reading = Gate::new(MAX_READING);
@@ -154,19 +155,18 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
             | Body::GetPortraits(_)
             | Body::SuggestNext(_)
             | Body::EventsSince(_) => {
-                // Who has much unread keeps no place from others until it has read.
-                let asks = in_hand.incoming.reply_to.client().cloned();
-                let asks = asks.filter(|client| !daemon.replies.has_room(client));
-                let turn = asks.is_none().then(|| readers.queue(&client));
-                let (readers, computing) = (Arc::clone(&readers), Arc::clone(&computing));
+                let gate = if is_bulk(&body) { &bulk } else { &readers };
+                let (gate, computing) = (Arc::clone(gate), Arc::clone(&computing));
+                let peer = in_hand.incoming.reply_to.client().cloned();
+                let turn = gate.queue(&client);
                 let frames = std::mem::take(&mut in_hand.incoming.frames);
                 tokio::spawn(in_hand.respond(daemon, async move |d| {
-                    if let Some(asks) = asks {
-                        let end = |client| d.outbox.end(client);
-                        d.replies.room(&asks, end).await?;
-                    }
-                    let turn = turn.unwrap_or_else(|| readers.queue(&client));
-                    let pass = turn.come().await;
+                    let pass = match peer {
+                        Some(peer) => {
+                            pass_with_room(&d, &peer, turn, || gate.queue(&client)).await?
+                        }
+                        None => turn.come().await,
+                    };
                     let looked = blocking(&d, move |d| reads::look_up(d, body)).await;
                     drop(pass);
                     match looked.unwrap_or_else(|panic| Err(panic_error(&panic)))? {
@@ -178,6 +178,41 @@ pub(crate) async fn dispatch(daemon: Arc<Daemon>, mut requests: mpsc::Receiver<I
                     }
                 }));
             }
+        }
+    }
+}
+
+/// Whether a read copies whole files or arrays; a short one does not wait for such.
+fn is_bulk(body: &Body) -> bool {
+    matches!(
+        body,
+        Body::GetOriginal(_)
+            | Body::LabelsSnapshot(_)
+            | Body::GetSpectrum(_)
+            | Body::GetHks(_)
+            | Body::GetDescriptors(_)
+            | Body::GetPortraits(_)
+    )
+}
+
+/// The pass of a read once its client has read enough of earlier replies. Until then the client
+/// keeps no place from others.
+async fn pass_with_room(
+    daemon: &Daemon,
+    peer: &Bytes,
+    turn: Turn,
+    queue: impl Fn() -> Turn,
+) -> Result<Pass, wire::Error> {
+    let mut turn = Some(turn);
+    loop {
+        if !daemon.replies.has_room(peer) {
+            turn = None;
+            let end = |client| daemon.outbox.end(client);
+            daemon.replies.room(peer, end).await?;
+        }
+        let pass = turn.take().unwrap_or_else(&queue).come().await;
+        if daemon.replies.has_room(peer) {
+            return Ok(pass);
         }
     }
 }

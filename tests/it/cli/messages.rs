@@ -23,7 +23,7 @@ fn a_folder_with_bad_and_double_names_adds_the_rest() {
     for part in [
         "a\\nb.off: the shape name \"a\\nb\" has '\\n'",
         "c\\td.off: the shape name \"c\\td\" has '\\t'",
-        "9.off: would be named \"9\", as ",
+        "9.stl: would be named \"9\", as ",
     ] {
         assert!(said.contains(part), "{part}: {said}");
     }
