@@ -9,7 +9,7 @@ bin="$PWD/target/release/coseg"
 # What the binary says of itself, and the documents.
 share=target/package/share
 rm -rf "$share"
-install -Dm644 -t "$share/doc/coseg" README.md LICENSE-MIT LICENSE-APACHE docs/*.md
+install -Dm644 -t "$share/doc/coseg" README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE docs/*.md
 if "$bin" man --help >/dev/null 2>&1; then
     mkdir -p "$share/man/man1"
     "$bin" man --out "$share/man/man1" 2>/dev/null

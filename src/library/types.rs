@@ -431,7 +431,7 @@ pub enum EventKind {
     },
     /// The parts of the collection were clustered anew.
     Reclustered {
-        /// Score of the labelling before and after; see docs/architecture.md.
+        /// Score of the labelling before and after; see docs/methods.md.
         score_before: Option<f64>,
         /// Score of the new labelling.
         score_after: f64,

@@ -322,7 +322,7 @@ def main() -> int:
     coseg = Path(sys.argv[1]).resolve()
     # A shell ignores interrupts in what it starts in the background, and children inherit that; one who types does not.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    every = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").glob("*.md"))]
+    every = ["README.md", "CHANGELOG.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").glob("*.md"))]
     every += sorted(str(p.relative_to(ROOT)) for p in (ROOT / "clients").glob("*/README.md"))
     documents = sys.argv[2:] or every
     faults: list[str] = []

@@ -54,22 +54,22 @@ def spoilt() -> dict[str, tuple[str, bytes]]:
     ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     ply += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 zero\n3 0 1 2\n"
     return {
-        "a face names a vertex that is not there": ("a.off", CUBE_OFF.replace("3 1 2 3", "3 1 2 9").encode()),
-        "a coordinate is no number": ("b.off", CUBE_OFF.replace("1 0 0", "nan 0 0").encode()),
-        "cut off in the middle": ("c.off", CUBE_OFF[:45].encode()),
+        "a face names a missing vertex": ("a.off", CUBE_OFF.replace("3 1 2 3", "3 1 2 9").encode()),
+        "a coordinate is not a number": ("b.off", CUBE_OFF.replace("1 0 0", "nan 0 0").encode()),
+        "truncated in the middle": ("c.off", CUBE_OFF[:45].encode()),
         "no faces": ("d.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
         "all vertices on a line": ("e.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"),
         "a vertex is missing a coordinate": ("f.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n"),
-        "binary STL that is shorter than it says": ("g.stl", stl),
+        "a binary STL that is shorter than its header declares": ("g.stl", stl),
         "a word among the numbers of a PLY": ("h.ply", ply.encode()),
-        "glTF with its buffer in another file": ("i.gltf", json.dumps(gltf).encode()),
-        "glTF that needs Draco": ("j.gltf", json.dumps(draco).encode()),
-        "a glTF node names a mesh that is not there": (
+        "a glTF with its buffer in another file": ("i.gltf", json.dumps(gltf).encode()),
+        "a glTF that requires Draco": ("j.gltf", json.dumps(draco).encode()),
+        "a glTF node names a missing mesh": (
             "m.gltf",
             json.dumps(gltf | {"nodes": [{"mesh": 17}]}).encode(),
         ),
-        "another format than its name says": ("k.glb", CUBE_OFF.encode()),
-        "nothing in it": ("l.ply", b""),
+        "another format than the name of the file says": ("k.glb", CUBE_OFF.encode()),
+        "an empty file": ("l.ply", b""),
     }
 
 
@@ -146,16 +146,17 @@ def main() -> int:
     lines = [
         "# Messy files, one by one",
         "",
-        "Written by `python3 tests/formats/messy.py target/release/coseg FOLDER docs/messy.md`, where FOLDER has files from the test",
-        "models of four libraries as they are. What is read, put right and refused in general is in [formats](formats.md).",
+        "`python3 tests/formats/messy.py target/release/coseg FOLDER docs/messy.md` generates this page.",
+        "FOLDER has unmodified files from the test models of four libraries. [formats](formats.md) lists the",
+        "supported formats, the repairs and the reasons for refusal in general.",
         "",
-        "| file | faces | outcome | what was found |",
+        "| file | faces | outcome | report of cleaning |",
         "| --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in rows),
         "",
-        "And files that were spoilt on purpose, with what is said of each:",
+        "The following files were damaged on purpose, and each is refused with this message:",
         "",
-        "| what was done | format | refused, because |",
+        "| damage | format | message |",
         "| --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in refused),
     ]
