@@ -6,8 +6,9 @@
 use crate::daemon::{Daemon, blocking};
 use crate::ipc::wire::{self, event::Kind};
 use crate::ipc::{HEARTBEAT_TOPIC, convert, topic};
+use crate::library::{Event, EventKind};
 use prost::Message as _;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -16,6 +17,9 @@ use tokio::sync::mpsc;
 const BATCH: usize = 256;
 /// Time between heartbeats.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Deleted collections that heartbeats still name, so that whoever missed the deletion notices. The
+/// oldest is dropped beyond: clients may create and delete collections without end.
+const MAX_DELETED: usize = 256;
 
 /// What the publisher is told.
 #[derive(Debug, PartialEq, Eq)]
@@ -28,12 +32,39 @@ pub(crate) enum Notice {
     Stop,
 }
 
+/// How far the log of each collection was published.
+struct Published {
+    sequences: BTreeMap<String, u64>,
+    /// Collections of these whose newest event is their deletion, oldest first.
+    deleted: VecDeque<String>,
+}
+
+impl Published {
+    /// Notes that an event of a collection was published.
+    fn advance(&mut self, collection: &str, event: &Event) {
+        self.sequences.insert(collection.to_owned(), event.sequence);
+        self.deleted.retain(|name| name != collection);
+        if event.kind == EventKind::CollectionDeleted {
+            self.deleted.push_back(collection.to_owned());
+        }
+        if self.deleted.len() > MAX_DELETED
+            && let Some(oldest) = self.deleted.pop_front()
+        {
+            self.sequences.remove(&oldest);
+        }
+    }
+}
+
 /// Publishes until it is told to stop. `published` says how far each log was published before.
 pub(crate) async fn run(
     daemon: Arc<Daemon>,
     mut notices: mpsc::UnboundedReceiver<Notice>,
-    mut published: BTreeMap<String, u64>,
+    published: BTreeMap<String, u64>,
 ) {
+    let mut published = Published {
+        sequences: published,
+        deleted: VecDeque::new(),
+    };
     let mut heartbeat = tokio::time::interval(HEARTBEAT);
     heartbeat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {
@@ -44,20 +75,21 @@ pub(crate) async fn run(
                 }
                 Some(Notice::Created(collection, sequence)) => {
                     // The log may hold events of an earlier collection of the name.
-                    published.entry(collection.clone()).or_insert(sequence.saturating_sub(1));
+                    let entry = published.sequences.entry(collection.clone());
+                    entry.or_insert(sequence.saturating_sub(1));
                     catch_up(&daemon, collection, &mut published).await;
                 }
                 Some(Notice::Stop) | None => return,
             },
-            _ = heartbeat.tick() => send_heartbeat(&daemon, &published),
+            _ = heartbeat.tick() => send_heartbeat(&daemon, &published.sequences),
         }
     }
 }
 
 /// Publishes what the log has beyond what was published.
-async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTreeMap<String, u64>) {
-    loop {
-        let after = published.get(&collection).copied().unwrap_or(0);
+async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut Published) {
+    // Of a collection that nobody has noticed, or whose deletion is long published, nothing is left.
+    while let Some(&after) = published.sequences.get(&collection) {
         let name = collection.clone();
         let events = blocking(daemon, move |d| d.library.events_since(&name, after, BATCH)).await;
         let events = match events {
@@ -76,7 +108,7 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut BTre
             let body = convert::event(&collection, event).encode_to_vec();
             daemon.outbox.event(topic(&collection), body);
             daemon.metrics.events.inc();
-            published.insert(collection.clone(), event.sequence);
+            published.advance(&collection, event);
         }
         if events.len() < BATCH {
             return;
@@ -103,4 +135,38 @@ fn send_heartbeat(daemon: &Daemon, published: &BTreeMap<String, u64>) {
     daemon
         .outbox
         .event(HEARTBEAT_TOPIC.to_vec(), event.encode_to_vec());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Event, EventKind, MAX_DELETED, Published};
+    use std::collections::{BTreeMap, VecDeque};
+
+    #[test]
+    fn collections_that_come_and_go_are_forgotten_and_others_are_not() {
+        let mut published = Published {
+            sequences: BTreeMap::new(),
+            deleted: VecDeque::new(),
+        };
+        let event = |sequence, kind| Event { sequence, kind };
+        let mut advance = |name: &str, sequence, kind| {
+            published.advance(name, &event(sequence, kind));
+            published.sequences.len()
+        };
+        advance("stays", 1, EventKind::CollectionCreated);
+        advance("comes back", 1, EventKind::CollectionCreated);
+        advance("comes back", 2, EventKind::CollectionDeleted);
+        advance("comes back", 3, EventKind::CollectionCreated);
+        let mut most = 0;
+        for n in 0..4 * MAX_DELETED {
+            let name = format!("c{n}");
+            advance(&name, 1, EventKind::CollectionCreated);
+            most = most.max(advance(&name, 2, EventKind::CollectionDeleted));
+        }
+        assert_eq!(most, MAX_DELETED + 2);
+        assert_eq!(published.sequences["stays"], 1);
+        assert_eq!(published.sequences["comes back"], 3);
+        let newest = format!("c{}", 4 * MAX_DELETED - 1);
+        assert_eq!(published.sequences[&newest], 2);
+    }
 }
