@@ -7,11 +7,18 @@
 /// The column of each row, `(n_rows,)`, in an assignment of least total cost.
 ///
 /// `cost` is `(n_rows, n_cols)`, row-major, finite. All rows are assigned when `n_rows <= n_cols`;
-/// otherwise `n_cols` of them are, and the others are `None`. Among assignments of equal cost one is
-/// chosen that depends on the matrix alone. Cost: O(min² · max).
+/// otherwise `n_cols` of them are, and the others are `None`. Among assignments of equal cost one
+/// is chosen that depends on the matrix alone. Cost: O(min² · max).
+///
+/// ```
+/// use coseg_geometry::linalg::assignment::assignment;
+///
+/// // The cheapest entry, 0, is not taken: it would leave 10 for the second row.
+/// assert_eq!(assignment(&[0.0, 1.0, 1.0, 10.0], 2, 2), [Some(1), Some(0)]);
+/// assert_eq!(assignment(&[3.0, 1.0], 2, 1), [None, Some(0)]);
+/// ```
 ///
 /// # Panics
-///
 /// If `cost` does not hold `n_rows · n_cols` values, or one of them is not finite.
 pub fn assignment(cost: &[f64], n_rows: usize, n_cols: usize) -> Vec<Option<usize>> {
     assert_eq!(
