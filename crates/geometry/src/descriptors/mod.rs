@@ -105,7 +105,8 @@ pub fn face_kernels(eigenvalues: &[f64]) -> PointKernels {
 /// let kernels = face_kernels(&sphere.spectrum.eigenvalues);
 /// let kernels = kernels.of_matrix(&sphere.spectrum.eigenvectors);
 /// let found = face_descriptors(mesh, bridges, &DualGraph::new(mesh, bridges), &kernels);
-/// assert_eq!(found.n, GROUPS.iter().map(|(_, width)| width).sum());
+/// let width: usize = GROUPS.iter().map(|(_, width)| width).sum();
+/// assert_eq!(found.n, width);
 /// assert_eq!(found.data.len(), mesh.faces.len() * found.n);
 /// // A sphere is as thick everywhere: column 0 is the logarithm of the shape diameter.
 /// let thickness = |f: usize| found.data[f * found.n];

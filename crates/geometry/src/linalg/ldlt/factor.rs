@@ -47,12 +47,12 @@ impl Factor {
     ///     values: vec![2.0, -1.0, -1.0, 2.0], // with eigenvalues 1 and 3
     /// };
     /// let analysis = Analysis::new(&matrix)?;
-    /// let factor = Factor::new(&analysis, &matrix.permuted(&analysis.order), 2.0)?;
-    /// assert_eq!(factor.n_negative, 1); // one eigenvalue is below 2
+    /// let factor = Factor::new(&analysis, &matrix.permuted(&analysis.order), 2.5)?;
+    /// assert_eq!(factor.n_negative, 1); // one eigenvalue is below 2.5
     /// let mut panel = zero_panel(2);
     /// panel[..2].fill(Row([1.0; 8])); // (1, 1), the eigenvector of 1, eight times
     /// factor.solve(&mut panel, false);
-    /// assert!((panel[0].0[0] + 1.0).abs() < 1e-12); // 1 / (1 − 2)
+    /// assert!((panel[0].0[0] * (1.0 - 2.5) - 1.0).abs() < 1e-12);
     /// # Ok::<_, coseg_geometry::linalg::ldlt::LdltError>(())
     /// ```
     ///
