@@ -1,7 +1,8 @@
 //! How fast the kernels of the geometry are: `cargo bench -p coseg-geometry`, with a word after `--`
 //! for those whose names contain it. One thread; the meshes are made here.
 
-use coseg_geometry::descriptors::{face_descriptors, face_kernels};
+use coseg_geometry::SpectralMesh;
+use coseg_geometry::descriptors::{FaceDescriptors, face_descriptors, face_kernels};
 use coseg_geometry::fmap::{EstimateOptions, point_maps, zoomout};
 use coseg_geometry::linalg::maxflow::Network;
 use coseg_geometry::linalg::nearest::nearest_rows;
@@ -9,7 +10,6 @@ use coseg_geometry::mesh::{self, DualGraph, TriMesh, icosphere};
 use coseg_geometry::operators::{Operator, laplacian};
 use coseg_geometry::segmentation::patches;
 use coseg_geometry::spectrum::{Options, Spectrum};
-use coseg_geometry::{SpectralMesh, descriptors::FaceDescriptors};
 use divan::{Bencher, counter::ItemsCount};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
@@ -64,6 +64,7 @@ fn spectrum(bencher: Bencher<'_, '_>, (levels, k): (u32, usize)) {
     let operator = laplacian(&lumpy(levels, 1.0), &[], Operator::Tufted).expect("a closed surface");
     bencher.bench_local(|| {
         Spectrum::smallest(&operator.stiffness, &operator.mass, k, &Options::default())
+            .expect("a closed surface has a spectrum")
     });
 }
 
@@ -122,7 +123,12 @@ fn minimum_cut(bencher: Bencher<'_, '_>, side: usize) {
         let right = (node % side + 1 < side).then_some(node + 1);
         let below = (node + side < side * side).then_some(node + side);
         for other in [right, below].into_iter().flatten() {
-            network.edge(node, other, rng.random_range(0..60), rng.random_range(0..60));
+            network.edge(
+                node,
+                other,
+                rng.random_range(0..60),
+                rng.random_range(0..60),
+            );
         }
     }
     bencher
