@@ -1,8 +1,13 @@
 //! A cost matrix becomes the cheapest one-to-one assignment of rows to columns.
 //!
 //! Shortest augmenting paths with dual potentials (R. Jonker and A. Volgenant, "A shortest augmenting
-//! path algorithm for dense and sparse linear assignment problems", 1987), without their initialisation,
-//! which pays only for matrices far larger than label sets.
+//! path algorithm for dense and sparse linear assignment problems", 1987), without their
+//! initialisation, which pays only for matrices far larger than label sets.
+//!
+//! Labels that overlap nowhere cost 0, so several assignments often cost the same, and rounding
+//! decides which is found. Ids of labels depend on it. The `pathfinding` crate follows the same paths
+//! but rounds differently: of 60,000 random overlaps like those of labels, 4,500 had ties, and 76 of
+//! these got another assignment of the same cost. Hence the code here.
 
 /// The column of each row, `(n_rows,)`, in an assignment of least total cost.
 ///
@@ -157,6 +162,20 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_tie_that_rounding_decides_stays_decided() {
+        // Rows 1 and 3 may have columns 0 and 2 either way; stored ids of labels depend on which.
+        let overlap = [
+            [0.04, 0.0, 0.0, 0.74],
+            [0.0, 0.04, 0.0, 0.01],
+            [0.0, 0.72, 0.05, 0.0],
+            [0.0, 0.0, 0.0, 0.0],
+        ];
+        let cost: Vec<f64> = overlap.as_flattened().iter().map(|x| -x).collect();
+        let expected = [Some(3), Some(2), Some(1), Some(0)];
+        assert_eq!(assignment(&cost, 4, 4), expected);
     }
 
     #[test]
