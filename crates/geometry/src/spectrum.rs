@@ -102,6 +102,20 @@ pub struct Certificate {
 impl Certificate {
     /// Whether the count holds for the matrix as given, whatever rounding did: no eigenvalue within
     /// `perturbation` of `tau`. If not, pairs and count agree all the same, but that is no proof.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Options, Spectrum};
+    ///
+    /// let sphere = laplacian(&icosphere(4), &[], Operator::Tufted)?;
+    /// let found = Spectrum::smallest(&sphere.stiffness, &sphere.mass, 10, &Options::default())?;
+    /// let certificate = found.certificate;
+    /// assert!(certificate.proved() && certificate.perturbation < certificate.margin);
+    /// // At least those that were asked for lie below τ: those of a multiplet come together.
+    /// assert!(certificate.count >= 10 && found.eigenvalues[9] < certificate.tau);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     pub fn proved(&self) -> bool {
         self.perturbation < self.margin
     }

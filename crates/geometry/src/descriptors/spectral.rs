@@ -125,7 +125,22 @@ impl PointKernels {
         self.weights.apply(rows, width, out);
     }
 
-    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major.
+    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major. Columns beyond
+    /// the k-th do not count.
+    ///
+    /// ```
+    /// use coseg_geometry::descriptors::{PointKernels, hks};
+    /// use nalgebra::DMatrix;
+    ///
+    /// let (values, times) = ([0.0, 1.0], [0.5, 2.0]);
+    /// let vectors = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 1.0, -1.0]);
+    /// let found = PointKernels::new(&values, &times, 0).of_matrix(&vectors);
+    /// let single: Vec<f32> = found.iter().map(|x| *x as f32).collect();
+    /// assert_eq!(single, hks(&values, &vectors, &times));
+    /// ```
+    ///
+    /// # Panics
+    /// If there are fewer than k columns.
     pub fn of_matrix(&self, eigenvectors: &DMatrix<f64>) -> Vec<f64> {
         let (n, k) = (eigenvectors.nrows(), self.weights.n_in());
         let mut out = vec![0.0; n * self.n_columns()];

@@ -159,7 +159,8 @@ impl SampledBasis {
         columns(&self.rows, self.k, k)
     }
 
-    /// Coefficients `(k, dim)` of functions given at the samples `(n, dim)`, by least squares.
+    /// Coefficients `(k, dim)` of functions given at the samples `(n, dim)`, by least squares
+    /// weighted by mass. See [`SampledBasis::new`] for an example.
     pub fn fit(&self, values: &[f32], dim: usize, k: usize) -> Vec<f32> {
         let weighted = columns(&self.weighted, self.k, k);
         let right = super::basis::transposed_product(&weighted, values, self.n, k, dim);

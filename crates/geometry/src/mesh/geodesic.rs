@@ -171,9 +171,23 @@ impl EdgeGraph {
 
     /// As [`Self::dijkstra`], into memory that is used again.
     ///
-    /// By buckets in the place of a heap (Meyer and Sanders 2003, *Δ-stepping*): the few vertices that
-    /// are visited twice cost less than keeping an order. The distances are the same bits, because sums
-    /// along a path do not depend on when they are made.
+    /// By buckets in the place of a heap (Meyer and Sanders 2003, *Δ-stepping*): the few vertices
+    /// that are visited twice cost less than keeping an order. The distances are the same bits,
+    /// because sums along a path do not depend on when they are made.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{EdgeGraph, geodesic::Distances, icosphere};
+    ///
+    /// let graph = EdgeGraph::new(&icosphere(2), &[]);
+    /// let mut distances = Distances::default();
+    /// for source in [0, 50] {
+    ///     graph.dijkstra_into(source, &mut distances);
+    ///     assert_eq!(distances.values, graph.dijkstra(source));
+    /// }
+    /// ```
+    ///
+    /// # Panics
+    /// If the vertex does not exist.
     pub fn dijkstra_into(&self, source: u32, distances: &mut Distances) {
         distances.reset(self.n_vertices());
         let Distances {

@@ -52,6 +52,15 @@ impl Surface {
     }
 
     /// The surface, where geometry and dual graph are there already.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{DualGraph, FaceGeometry, icosphere};
+    /// use coseg_geometry::segmentation::Surface;
+    ///
+    /// let sphere = icosphere(1);
+    /// let (geometry, dual) = (FaceGeometry::new(&sphere), DualGraph::new(&sphere, &[]));
+    /// assert_eq!(Surface::from_dual(&geometry, &dual), Surface::new(&sphere));
+    /// ```
     pub fn from_dual(geometry: &FaceGeometry, dual: &DualGraph) -> Self {
         let total: f64 = geometry.areas.iter().sum();
         let real = dual.edges.iter().filter(|e| !e.bridge);

@@ -99,11 +99,25 @@ impl Eigenpairs {
         self.eigenvalues.len()
     }
 
-    /// Writes rows of Φ to `out`, row-major, from vertex `first` on: as many as `out` has multiples of k.
-    /// `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the first such) is positive.
+    /// Writes rows of Φ to `out`, row-major, from vertex `first` on: as many as `out` has multiples
+    /// of k. `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the first such) is
+    /// positive.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Eigenpairs, Options};
+    ///
+    /// let sphere = laplacian(&icosphere(2), &[], Operator::Tufted)?;
+    /// let pairs = Eigenpairs::smallest(&sphere.stiffness, &sphere.mass, 4, &Options::default())?;
+    /// let mut two = [0.0; 2 * 4];
+    /// pairs.rows(20, &mut two);
+    /// assert_eq!(two, pairs.all_rows()[20 * 4..22 * 4]);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     ///
     /// # Panics
-    /// Rows beyond the last.
+    /// If `out` has room for rows beyond the last.
     pub fn rows(&self, first: usize, out: &mut [f64]) {
         let rows = out.chunks_exact_mut(self.k());
         for (&(part, at), row) in self.places[first..first + rows.len()].iter().zip(rows) {
