@@ -1,5 +1,5 @@
-//! How fast the kernels of the geometry are: `cargo bench -p coseg-geometry`, with a word after `--`
-//! for those whose names contain it. One thread; the meshes are made here.
+//! How fast the kernels of the geometry are: `cargo bench -p coseg-geometry`, with a word after
+//! `--` for those whose names contain it. One thread; the meshes are made here.
 
 use coseg_geometry::SpectralMesh;
 use coseg_geometry::descriptors::{FaceDescriptors, face_descriptors, face_kernels};
