@@ -108,7 +108,18 @@ impl Description {
 }
 
 impl DescriptionView<'_> {
-    /// The proxy as a mesh.
+    /// The proxy as a mesh, in double precision.
+    ///
+    /// ```
+    /// use coseg_geometry::description::Description;
+    ///
+    /// let triangle = Description {
+    ///     vertices: vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+    ///     faces: vec![[0, 1, 2]],
+    ///     ..Description::default()
+    /// };
+    /// assert_eq!(triangle.view().mesh().corners(0)[1], [1.0, 0.0, 0.0]);
+    /// ```
     pub fn mesh(&self) -> TriMesh {
         TriMesh {
             vertices: self.vertices.iter().map(|v| v.map(f64::from)).collect(),

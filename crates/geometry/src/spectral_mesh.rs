@@ -123,12 +123,27 @@ impl SpectralMesh {
     /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
     /// ```
     pub fn point_shape(&self, options: &EstimateOptions) -> PointShape<'_> {
-        let basis = Basis {
+        PointShape::new(&self.vertices, &self.mesh.faces, self.basis(), options)
+    }
+
+    /// The spectrum as functional maps take it: row-major, in single precision, total mass 1.
+    ///
+    /// ```
+    /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+    ///
+    /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 4, &Options::default())?;
+    /// // The constant function 2 has one coefficient.
+    /// let coefficients = sphere.basis().project(&[2.0; 162], 1, 4);
+    /// assert!((coefficients[0].abs() - 2.0).abs() < 1e-4);
+    /// assert!(coefficients[1..].iter().all(|c| c.abs() < 1e-4));
+    /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+    /// ```
+    pub fn basis(&self) -> Basis<'_> {
+        Basis {
             eigenvalues: &self.spectrum.eigenvalues,
             eigenvectors: &self.eigenvectors,
             n_eigenvectors: self.spectrum.eigenvalues.len(),
             mass: &self.mass,
-        };
-        PointShape::new(&self.vertices, &self.mesh.faces, basis, options)
+        }
     }
 }

@@ -102,6 +102,20 @@ pub struct Certificate {
 impl Certificate {
     /// Whether the count holds for the matrix as given, whatever rounding did: no eigenvalue within
     /// `perturbation` of `tau`. If not, pairs and count agree all the same, but that is no proof.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Options, Spectrum};
+    ///
+    /// let sphere = laplacian(&icosphere(4), &[], Operator::Tufted)?;
+    /// let found = Spectrum::smallest(&sphere.stiffness, &sphere.mass, 10, &Options::default())?;
+    /// let certificate = found.certificate;
+    /// assert!(certificate.proved() && certificate.perturbation < certificate.margin);
+    /// // At least those that were asked for lie below τ: those of a multiplet come together.
+    /// assert!(certificate.count >= 10 && found.eigenvalues[9] < certificate.tau);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     pub fn proved(&self) -> bool {
         self.perturbation < self.margin
     }
@@ -147,9 +161,27 @@ impl Spectrum {
     /// The `k` smallest eigenpairs of `W φ = λ A φ`: `stiffness` W `(n, n)` symmetric positive
     /// semidefinite, `mass` the diagonal of A `(n,)`, positive; `1 <= k <= n`.
     ///
-    /// Disconnected domains are fine (an eigenvalue 0 for each component). The cost is about
-    /// `n k²` for surfaces, `n³` for the dense route (k above about n/3). The eigenvectors are copied
+    /// Disconnected domains are fine (an eigenvalue 0 for each component). The cost is about `n k²`
+    /// for surfaces, `n³` for the dense route (k above about n/3). The eigenvectors are copied
     /// once, out of the solver's memory; [`Eigenpairs::smallest`] leaves them there.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Options, Spectrum};
+    ///
+    /// let sphere = laplacian(&icosphere(3), &[], Operator::Tufted)?;
+    /// let found = Spectrum::smallest(&sphere.stiffness, &sphere.mass, 9, &Options::default())?;
+    /// assert!(found.certificate.proved()); // no eigenvalue is missing
+    /// // The unit sphere has l (l + 1), 2 l + 1 times each.
+    /// let rounded: Vec<f64> = found.eigenvalues.iter().map(|x| x.round()).collect();
+    /// assert_eq!(rounded, [0.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0, 6.0]);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// Matrices that are not as above, a cancelled solve, or a spectrum whose completeness could
+    /// not be shown: see [`SpectrumError`].
     pub fn smallest(
         stiffness: &sprs::CsMat<f64>,
         mass: &[f64],

@@ -27,6 +27,20 @@ pub struct GeodesicProfile {
 }
 
 /// The profile of a mesh, connected by its bridges: sixty shortest-path searches, O(n log n) each.
+/// Distances are in units of the mesh.
+///
+/// ```
+/// use coseg_geometry::descriptors::geodesic_profile;
+/// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+///
+/// let sphere = icosphere(3);
+/// let profile = geodesic_profile(&sphere, &[], &FaceGeometry::new(&sphere));
+/// // The mean distance on the unit sphere is π / 2; paths along edges are somewhat longer.
+/// let quarter = std::f64::consts::FRAC_PI_2;
+/// assert!(profile.average.iter().all(|d| (0.95 * quarter..1.2 * quarter).contains(d)));
+/// // A larger ball has a larger share of the area.
+/// assert!(profile.area_within.chunks_exact(7).all(|row| row.is_sorted()));
+/// ```
 pub fn geodesic_profile(
     mesh: &TriMesh,
     bridges: &[Bridge],

@@ -53,10 +53,24 @@ pub(super) fn principal(matrix: Matrix3<f64>) -> ([f64; 3], [[f64; 3]; 3]) {
     (values, vectors)
 }
 
-/// Local principal components `(m, 15)`, row-major. For each of the radii 0.05, 0.1 and 0.2, over the
-/// faces whose centroids are within it, with e₁ ≥ e₂ ≥ e₃ the variances: `(e₁ − e₂)/e₁` (linear),
-/// `(e₂ − e₃)/e₁` (planar), `e₃/e₁` (scattered), area over that of the disc, and |normal · axis of e₁|.
-/// O(m × faces in a ball).
+/// Local principal components `(m, 15)`, row-major, of a mesh of area 1. For each of the radii
+/// 0.05, 0.1 and 0.2, over the faces whose centroids are within it, with e₁ ≥ e₂ ≥ e₃ the
+/// variances: `(e₁ − e₂)/e₁` (linear), `(e₂ − e₃)/e₁` (planar), `e₃/e₁` (scattered), area over that
+/// of the disc, and |normal · axis of e₁|. O(m × faces in a ball).
+///
+/// ```
+/// use coseg_geometry::descriptors::local_pca;
+/// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+///
+/// let mut sphere = icosphere(3);
+/// let radius = 0.5 / std::f64::consts::PI.sqrt(); // of a sphere of area 1
+/// sphere.vertices.iter_mut().flatten().for_each(|x| *x *= radius);
+/// for row in local_pca(&FaceGeometry::new(&sphere)).chunks_exact(15) {
+///     let [linear, planar, scattered] = [row[5], row[6], row[7]]; // within 0.1
+///     assert!((linear + planar + scattered - 1.0).abs() < 1e-9);
+///     assert!(planar > scattered); // a small piece of a sphere is nearly flat
+/// }
+/// ```
 pub fn local_pca(geometry: &FaceGeometry) -> Vec<f64> {
     let mut result = vec![0.0; geometry.areas.len() * N_COLUMNS];
     let cells = Cells::new(geometry);

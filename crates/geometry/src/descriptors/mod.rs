@@ -71,20 +71,48 @@ pub struct FaceDescriptors {
     pub farthest_start: u32,
 }
 
-/// The kernels that [`face_descriptors`] takes, for the `eigenvalues` of a proxy; as many columns of
-/// eigenvectors count as it takes pairs of.
+/// The kernels that [`face_descriptors`] takes, for the `eigenvalues` of a proxy; as many columns
+/// of eigenvectors count as it takes pairs of: at most 100.
+///
+/// ```
+/// use coseg_geometry::descriptors::face_kernels;
+///
+/// let eigenvalues: Vec<f64> = (0..300).map(f64::from).collect();
+/// // 16 times of the heat kernel and 20 energies of the wave kernel.
+/// assert_eq!(face_kernels(&eigenvalues).n_columns(), 36);
+/// ```
 pub fn face_kernels(eigenvalues: &[f64]) -> PointKernels {
     let k = eigenvalues.len().min(MAX_EIGENPAIRS);
     spectral::relative_kernels(&eigenvalues[..k], N_HEAT_TIMES, N_WAVE_ENERGIES)
 }
 
-/// Face descriptors of a proxy mesh of area 1 with its bridges, dual graph and the heat and wave `kernels`
-/// of its vertices (see [`face_kernels`]), the columns of all [`GROUPS`].
+/// Face descriptors `(m, 92)` of a proxy mesh of area 1 with its bridges, dual graph and the heat
+/// and wave `kernels` `(n, 36)` of its vertices (see [`face_kernels`]): the columns of all
+/// [`GROUPS`].
 ///
 /// Independent of rotation, reflection, translation and numbering up to rounding, with these
-/// exceptions: where principal axes are not unique (a sphere) `pos` depends on the coordinates, and the
-/// geodesic samples of a symmetric shape on the order of its vertices. About 50 ms for 2,500 faces,
-/// half of it for rays.
+/// exceptions: where principal axes are not unique (a sphere) `pos` depends on the coordinates, and
+/// the geodesic samples of a symmetric shape on the order of its vertices. About 50 ms for 2,500
+/// faces, half of it for rays.
+///
+/// ```
+/// use coseg_geometry::descriptors::{GROUPS, face_descriptors, face_kernels};
+/// use coseg_geometry::mesh::{DualGraph, icosphere};
+/// use coseg_geometry::{SpectralMesh, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 40, &Options::default())?;
+/// let (mesh, bridges) = (&sphere.mesh, &sphere.bridges);
+/// let kernels = face_kernels(&sphere.spectrum.eigenvalues);
+/// let kernels = kernels.of_matrix(&sphere.spectrum.eigenvectors);
+/// let found = face_descriptors(mesh, bridges, &DualGraph::new(mesh, bridges), &kernels);
+/// let width: usize = GROUPS.iter().map(|(_, width)| width).sum();
+/// assert_eq!(found.n, width);
+/// assert_eq!(found.data.len(), mesh.faces.len() * found.n);
+/// // A sphere is as thick everywhere: column 0 is the logarithm of the shape diameter.
+/// let thickness = |f: usize| found.data[f * found.n];
+/// assert!((0..mesh.faces.len()).all(|f| (thickness(f) - thickness(0)).abs() < 0.1));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn face_descriptors(
     mesh: &TriMesh,
     bridges: &[Bridge],

@@ -26,8 +26,20 @@ fn centroid(geometry: &FaceGeometry) -> [f64; 3] {
 }
 
 /// Position of each face `(m, 7)`, row-major: absolute coordinates along the three principal axes
-/// (longest first), distance to the centroid, and absolute cosines of the normal with the axes. Signs
-/// are dropped because those of the axes mean nothing.
+/// (longest first), distance to the centroid, and absolute cosines of the normal with the axes.
+/// Signs are dropped because those of the axes mean nothing. Lengths are in units of the mesh.
+///
+/// ```
+/// use coseg_geometry::descriptors::position;
+/// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+///
+/// let mut egg = icosphere(2);
+/// egg.vertices.iter_mut().for_each(|[_, y, _]| *y *= 2.0);
+/// let geometry = FaceGeometry::new(&egg);
+/// for (row, centroid) in position(&geometry).chunks_exact(7).zip(&geometry.centroids) {
+///     assert!((row[0] - centroid[1].abs()).abs() < 1e-6); // the longest axis is y
+/// }
+/// ```
 pub fn position(geometry: &FaceGeometry) -> Vec<f64> {
     let center = centroid(geometry);
     let mut covariance = Matrix3::zeros();
@@ -46,11 +58,25 @@ pub fn position(geometry: &FaceGeometry) -> Vec<f64> {
     result
 }
 
-/// For each face of a mesh whose `up` is known: height from 0 at the lowest to 1 at the highest face,
-/// distance from the vertical through the centroid over the largest one, the cosine of normal and up,
-/// its absolute value (a plate has the same above and below), and the share of the area that is lower
-/// (a seat is the middle of a chair, however long the legs); smoothed like the other face descriptors.
-/// `up` need not be of length 1; a flat or pole-like shape has 0 where there is no extent.
+/// For each face of a mesh whose `up` is known: height from 0 at the lowest to 1 at the highest
+/// face, distance from the vertical through the centroid over the largest one, the cosine of normal
+/// and up, its absolute value (a plate has the same above and below), and the share of the area
+/// that is lower (a seat is the middle of a chair, however long the legs); smoothed like the other
+/// face descriptors. `up` need not be of length 1; a flat or pole-like shape has 0 where there is
+/// no extent.
+///
+/// ```
+/// use coseg_geometry::descriptors::up_columns;
+/// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+///
+/// let sphere = icosphere(3);
+/// let centroids = FaceGeometry::new(&sphere).centroids;
+/// for (row, [_, _, z]) in up_columns(&sphere, [0.0, 0.0, 5.0]).iter().zip(&centroids) {
+///     // On a sphere the normal is the position; a zone has the area of its height (Archimedes).
+///     assert!((f64::from(row[2]) - z).abs() < 0.05);
+///     assert!((row[0] - row[4]).abs() < 0.05);
+/// }
+/// ```
 pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; N_UP_COLUMNS]> {
     let geometry = FaceGeometry::new(mesh);
     let axis = unit(up);

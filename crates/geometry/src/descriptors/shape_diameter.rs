@@ -19,11 +19,24 @@ const ANGLE_OFFSET: f64 = 0.2;
 /// Rays begin this far below the face, so as not to meet its neighbours in their common edges.
 const DEPTH: f64 = 1e-4;
 
-/// Shape diameter of each face `(m,)` of a mesh of area 1: the weighted mean length of rays within 60°
-/// of the inward normal, without outliers.
+/// Shape diameter of each face `(m,)` of a mesh of area 1: the weighted mean length of rays within
+/// 60° of the inward normal, without outliers. It has the unit of the mesh.
 ///
-/// Rays that leave through an opening do not count. A face none of whose rays meets anything gets the
-/// median of the others; on a mesh where no ray does (a sheet) all are 0. O(m log m) with 30 m rays.
+/// Rays that leave through an opening do not count. A face none of whose rays meets anything gets
+/// the median of the others; on a mesh where no ray does (a sheet) all are 0. O(m log m) with 30 m
+/// rays.
+///
+/// ```
+/// use coseg_geometry::descriptors::shape_diameter;
+/// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+///
+/// let mut sphere = icosphere(3);
+/// let radius = 0.5 / std::f64::consts::PI.sqrt(); // of a sphere of area 1
+/// sphere.vertices.iter_mut().flatten().for_each(|x| *x *= radius);
+/// let thickness = shape_diameter(&sphere, &FaceGeometry::new(&sphere));
+/// // A chord is as long as the diameter, or at 60° half as long.
+/// assert!(thickness.iter().all(|t| (radius..2.0 * radius).contains(t)));
+/// ```
 pub fn shape_diameter(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<f64> {
     let tree = Bvh::new(mesh);
     let rays = cone();

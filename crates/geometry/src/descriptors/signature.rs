@@ -8,9 +8,22 @@ const QUANTILES: [f64; 3] = [0.1, 0.5, 0.9];
 /// Eigenvalues of the ShapeDNA part.
 pub const N_SHAPE_DNA: usize = 20;
 
-/// Signature `(4 n + 20,)` of a shape whose face descriptors have n columns: their means over the area,
-/// then their 0.1, 0.5 and 0.9 quantiles over the area, then 20 logarithms of eigenvalues. Nothing is
-/// standardised or weighted: that needs the other shapes. O(m n log m).
+/// Signature `(4 n + 20,)` of a shape whose face descriptors have n columns: their means over the
+/// area, then their 0.1, 0.5 and 0.9 quantiles over the area, then 20 logarithms of eigenvalues.
+/// Nothing is standardised or weighted: that needs the other shapes. O(m n log m).
+///
+/// ```
+/// use coseg_geometry::descriptors::{FaceDescriptors, signature};
+/// use coseg_geometry::mesh::icosphere;
+///
+/// let sphere = icosphere(2);
+/// let constant = vec![7.0; sphere.faces.len()];
+/// let face = FaceDescriptors { data: constant, n: 1, farthest_start: 0 };
+/// let found = signature(&sphere, &face, &[0.0, 1.0]);
+/// assert_eq!(found.len(), 4 + 20);
+/// assert!((found[0] - 7.0).abs() < 1e-5); // the mean
+/// assert_eq!(found[1..4], [7.0; 3]); // the quantiles
+/// ```
 pub fn signature(mesh: &TriMesh, face: &FaceDescriptors, eigenvalues: &[f64]) -> Vec<f32> {
     let areas = FaceGeometry::new(mesh).areas;
     let total: f64 = areas.iter().sum();

@@ -21,13 +21,30 @@ const WAVE_WIDTH: f64 = 0.07;
 const BATCH: usize = 48;
 
 /// Number of eigenvalues (ascending) that are zero: one for each component of the domain.
+///
+/// ```
+/// use coseg_geometry::descriptors::null_space;
+///
+/// assert_eq!(null_space(&[0.0, 1e-12, 3.0]), 2);
+/// assert_eq!(null_space(&[]), 0);
+/// ```
 pub fn null_space(eigenvalues: &[f64]) -> usize {
     let zero = eigenvalues.last().map_or(0.0, |last| ZERO * last.max(0.0));
     eigenvalues.iter().take_while(|&&x| x <= zero).count()
 }
 
-/// `n_times` times `(n_times,)`, log-uniform from `4 ln 10 / λ_last` to `4 ln 10 / λ₂`, where λ₂ is the
-/// first eigenvalue above the null space. All 1 when there is none.
+/// `n_times` times `(n_times,)` for [`hks`], ascending and log-uniform from `4 ln 10 / λ_last` to
+/// `4 ln 10 / λ₂`, where λ₂ is the first eigenvalue above the null space. All 1 when there is none.
+/// The unit is that of the area.
+///
+/// ```
+/// use coseg_geometry::descriptors::hks_times;
+///
+/// let times = hks_times(&[0.0, 2.0, 8.0], 3);
+/// let expected = [0.5, 1.0, 2.0].map(|x| x * std::f64::consts::LN_10);
+/// assert!(times.iter().zip(expected).all(|(t, e)| (t - e).abs() < 1e-12));
+/// assert_eq!(hks_times(&[0.0], 2), [1.0, 1.0]);
+/// ```
 pub fn hks_times(eigenvalues: &[f64], n_times: usize) -> Vec<f64> {
     let Some((second, last)) = ends(eigenvalues) else {
         return vec![1.0; n_times];
@@ -57,8 +74,20 @@ pub struct PointKernels {
 }
 
 impl PointKernels {
-    /// For the heat kernel at `times` and the wave kernel at `n_energies` energies, uniform in log λ
-    /// from the first of the `eigenvalues` `(k,)` above the null space to the last. O(k (times + energies)).
+    /// For the heat kernel at `times` and the wave kernel at `n_energies` energies, uniform in log
+    /// λ from the first of the `eigenvalues` `(k,)` above the null space to the last. O(k (times +
+    /// energies)).
+    ///
+    /// ```
+    /// use coseg_geometry::descriptors::PointKernels;
+    ///
+    /// let kernels = PointKernels::new(&[0.0, 1.0], &[0.0, 2.0], 0);
+    /// let mut out = [0.0; 2];
+    /// // One point, where the eigenvectors are 1 and 3: Σ exp(−λ t) φ².
+    /// kernels.of_rows(&[1.0, 3.0], 2, &mut out);
+    /// assert_eq!(out[0], 1.0 + 9.0);
+    /// assert!((out[1] - (1.0 + 9.0 * (-2.0_f64).exp())).abs() < 1e-12);
+    /// ```
     pub fn new(eigenvalues: &[f64], times: &[f64], n_energies: usize) -> Self {
         let wave = wave_weights(eigenvalues, n_energies);
         let n_times = times.len();
@@ -96,7 +125,22 @@ impl PointKernels {
         self.weights.apply(rows, width, out);
     }
 
-    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major.
+    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major. Columns beyond
+    /// the k-th do not count.
+    ///
+    /// ```
+    /// use coseg_geometry::descriptors::{PointKernels, hks};
+    /// use nalgebra::DMatrix;
+    ///
+    /// let (values, times) = ([0.0, 1.0], [0.5, 2.0]);
+    /// let vectors = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 1.0, -1.0]);
+    /// let found = PointKernels::new(&values, &times, 0).of_matrix(&vectors);
+    /// let single: Vec<f32> = found.iter().map(|x| *x as f32).collect();
+    /// assert_eq!(single, hks(&values, &vectors, &times));
+    /// ```
+    ///
+    /// # Panics
+    /// If there are fewer than k columns.
     pub fn of_matrix(&self, eigenvectors: &DMatrix<f64>) -> Vec<f64> {
         let (n, k) = (eigenvectors.nrows(), self.weights.n_in());
         let mut out = vec![0.0; n * self.n_columns()];
@@ -117,8 +161,23 @@ impl PointKernels {
     }
 }
 
-/// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs there are
-/// both a value `(k,)` and a vector `(n, k)` of. Unit: 1 / area. O(n k times), as one matrix product.
+/// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs there
+/// are both a value `(k,)` and a vector `(n, k)` of. Positive; the unit is 1 / area, and for large
+/// times it is 1 over the area of the component. O(n k times), as one matrix product.
+///
+/// ```
+/// use coseg_geometry::descriptors::{hks, hks_times};
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 16, &Options::default())?;
+/// let times = hks_times(&sphere.spectrum.eigenvalues, 10);
+/// let values = hks(&sphere.spectrum.eigenvalues, &sphere.spectrum.eigenvectors, &times);
+/// // On a sphere all points are alike.
+/// for row in values.chunks_exact(10) {
+///     assert!(row.iter().zip(&values).all(|(x, first)| (x / first - 1.0).abs() < 0.05));
+/// }
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn hks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, times: &[f64]) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
     let kernels = PointKernels::new(&eigenvalues[..k], times, 0);
@@ -127,15 +186,44 @@ pub fn hks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, times: &[f64]) -> V
 
 /// Wave kernel signature `(n, n_energies)`, row-major: for energies uniform in log λ from the first
 /// eigenvalue above the null space to the last, the mean of `φ_i(x)²` under a Gaussian about the
-/// energy. Zero when no eigenvalue is above the null space.
+/// energy. The unit is 1 / area. Zero when no eigenvalue is above the null space.
+///
+/// ```
+/// use coseg_geometry::descriptors::wks;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
+/// let values = wks(&sphere.spectrum.eigenvalues, &sphere.spectrum.eigenvectors, 20);
+/// assert_eq!(values.len(), 162 * 20);
+/// // Its mean over the surface is 1 at each energy, since eigenvectors are mass-orthonormal.
+/// let rows = values.chunks_exact(20).zip(&sphere.laplacian.mass);
+/// let mean: f64 = rows.map(|(row, mass)| mass * f64::from(row[7])).sum();
+/// assert!((mean - 1.0).abs() < 1e-4);
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn wks(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, n_energies: usize) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
     let kernels = PointKernels::new(&eigenvalues[..k], &[], n_energies);
     to_single(&kernels.of_matrix(eigenvectors))
 }
 
-/// Global point signature `(n, dims)`, row-major: `φ_i(x) / √λ_i` for the first `dims` eigenvalues above
-/// the null space; zero beyond the last. Signs are those of the eigenvectors.
+/// Global point signature `(n, dims)`, row-major: `φ_i(x) / √λ_i` for the first `dims` eigenvalues
+/// above the null space; zero beyond the last. Signs are those of the eigenvectors. It has no unit:
+/// it does not depend on the scale of the mesh.
+///
+/// ```
+/// use coseg_geometry::descriptors::gps;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 4, &Options::default())?;
+/// let points = gps(&sphere.spectrum.eigenvalues, &sphere.spectrum.eigenvectors, 3);
+/// // Three dimensions of a sphere's embedding are a sphere again, of squared radius 3 / 8π.
+/// let square = 3.0 / (8.0 * std::f32::consts::PI);
+/// for p in points.chunks_exact(3) {
+///     assert!((p.iter().map(|x| x * x).sum::<f32>() / square - 1.0).abs() < 0.05);
+/// }
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn gps(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, dims: usize) -> Vec<f32> {
     let k = eigenvalues.len().min(eigenvectors.ncols());
     let scales = gps_scales(&eigenvalues[..k], dims);
@@ -150,8 +238,12 @@ pub fn gps(eigenvalues: &[f64], eigenvectors: &DMatrix<f64>, dims: usize) -> Vec
     result
 }
 
-/// `1 / √λ_i` of the first `dims` eigenvalues above the null space, by which a row of eigenvectors, from
-/// there on, is scaled to its global point signature; zero beyond the last.
+/// `1 / √λ_i` of the first `dims` eigenvalues above the null space, by which a row of eigenvectors,
+/// from there on, is scaled to its global point signature; zero beyond the last.
+///
+/// ```
+/// assert_eq!(coseg_geometry::descriptors::gps_scales(&[0.0, 4.0, 16.0], 3), [0.5, 0.25, 0.0]);
+/// ```
 pub fn gps_scales(eigenvalues: &[f64], dims: usize) -> Vec<f64> {
     let above = &eigenvalues[null_space(eigenvalues)..];
     (0..dims)
@@ -159,8 +251,15 @@ pub fn gps_scales(eigenvalues: &[f64], dims: usize) -> Vec<f64> {
         .collect()
 }
 
-/// ShapeDNA `(n,)`: logarithms of the first `n` eigenvalues above the null space, for a mesh of area 1.
-/// Where there are fewer the last one is repeated; 0 when there is none.
+/// ShapeDNA `(n,)`: logarithms of the first `n` eigenvalues above the null space, for a mesh of
+/// area 1. Where there are fewer the last one is repeated; 0 when there is none.
+///
+/// ```
+/// use coseg_geometry::descriptors::shape_dna;
+///
+/// assert_eq!(shape_dna(&[0.0, 1.0, std::f64::consts::E], 3), [0.0, 1.0, 1.0]);
+/// assert_eq!(shape_dna(&[0.0], 2), [0.0, 0.0]);
+/// ```
 pub fn shape_dna(eigenvalues: &[f64], n: usize) -> Vec<f32> {
     let above = &eigenvalues[null_space(eigenvalues)..];
     let at = |i: usize| above.get(i).or(above.last()).map_or(0.0, |x| x.ln() as f32);
@@ -198,7 +297,15 @@ pub(super) fn relative_kernels(
     }
 }
 
-/// Weight of each eigenpair at each energy `(k, n_energies)`; columns sum to 1.
+/// Weight of each eigenpair at each energy `(k, n_energies)`. Columns sum to 1, or are 0 when no
+/// eigenvalue is above the null space.
+///
+/// ```
+/// let weights = coseg_geometry::descriptors::wave_weights(&[0.0, 1.0, 2.0, 4.0], 3);
+/// assert_eq!(weights.shape(), (4, 3));
+/// assert!(weights.row(0).iter().all(|w| *w == 0.0)); // the null space has no energy
+/// assert!(weights.column_iter().all(|c| (c.sum() - 1.0).abs() < 1e-12));
+/// ```
 pub fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
     let k = eigenvalues.len();
     let skip = null_space(eigenvalues);

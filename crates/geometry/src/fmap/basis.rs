@@ -32,6 +32,22 @@ impl Basis<'_> {
     }
 
     /// The first `k` eigenvectors at some vertices `(vertices, k)`, row-major.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::Basis;
+    ///
+    /// let basis = Basis {
+    ///     eigenvalues: &[0.0, 1.0],
+    ///     eigenvectors: &[1.0, 2.0, 1.0, -2.0], // two vertices, two eigenvectors
+    ///     n_eigenvectors: 2,
+    ///     mass: &[0.5, 0.5],
+    /// };
+    /// assert_eq!(basis.rows(&[1, 0], 2), [1.0, -2.0, 1.0, 2.0]);
+    /// assert_eq!(basis.leading(1), [1.0, 1.0]);
+    /// ```
+    ///
+    /// # Panics
+    /// If there are fewer than `k` or a vertex does not exist.
     pub fn rows(&self, vertices: &[u32], k: usize) -> Vec<f32> {
         let mut rows = Vec::with_capacity(vertices.len() * k);
         for &v in vertices {
@@ -46,6 +62,18 @@ impl Basis<'_> {
     }
 
     /// Coefficients `(k, dim)` of functions `values (n, dim)`: `Φᵀ A values`, all row-major.
+    ///
+    /// ```
+    /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+    ///
+    /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 4, &Options::default())?;
+    /// // An eigenvector has one coefficient, its own.
+    /// let third: Vec<f32> = sphere.basis().rows(&Vec::from_iter(0..162), 4);
+    /// let third: Vec<f32> = third.chunks_exact(4).map(|row| row[2]).collect();
+    /// let found = sphere.basis().project(&third, 1, 4);
+    /// assert!((found[2] - 1.0).abs() < 1e-4 && found[1].abs() < 1e-4);
+    /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+    /// ```
     pub fn project(&self, values: &[f32], dim: usize, k: usize) -> Vec<f32> {
         let weighted: Vec<f32> = values
             .chunks_exact(dim.max(1))
@@ -56,7 +84,13 @@ impl Basis<'_> {
     }
 }
 
-/// `a b` with `a (m, inner)` and `b (inner, n)`, all row-major.
+/// `a b` `(m, n)` with `a (m, inner)` and `b (inner, n)`, all row-major.
+///
+/// ```
+/// use coseg_geometry::fmap::basis::product;
+///
+/// assert_eq!(product(&[1.0, 2.0, 3.0, 4.0], &[5.0, 6.0], 2, 2, 1), [17.0, 39.0]);
+/// ```
 pub fn product(a: &[f32], b: &[f32], m: usize, inner: usize, n: usize) -> Vec<f32> {
     let mut out = vec![0.0; m * n];
     matmul(
@@ -70,7 +104,13 @@ pub fn product(a: &[f32], b: &[f32], m: usize, inner: usize, n: usize) -> Vec<f3
     out
 }
 
-/// `a bᵀ` with `a (m, inner)` and `b (n, inner)`, all row-major.
+/// `a bᵀ` `(m, n)` with `a (m, inner)` and `b (n, inner)`, all row-major.
+///
+/// ```
+/// use coseg_geometry::fmap::basis::product_transposed;
+///
+/// assert_eq!(product_transposed(&[1.0, 2.0], &[3.0, 4.0, 5.0, 6.0], 1, 2, 2), [11.0, 17.0]);
+/// ```
 pub fn product_transposed(a: &[f32], b: &[f32], m: usize, inner: usize, n: usize) -> Vec<f32> {
     let mut out = vec![0.0; m * n];
     matmul(
@@ -84,7 +124,13 @@ pub fn product_transposed(a: &[f32], b: &[f32], m: usize, inner: usize, n: usize
     out
 }
 
-/// `aᵀ b` with `a (inner, m)` and `b (inner, n)`, all row-major.
+/// `aᵀ b` `(m, n)` with `a (inner, m)` and `b (inner, n)`, all row-major.
+///
+/// ```
+/// use coseg_geometry::fmap::basis::transposed_product;
+///
+/// assert_eq!(transposed_product(&[1.0, 2.0], &[3.0, 4.0], 2, 1, 1), [11.0]);
+/// ```
 pub fn transposed_product(a: &[f32], b: &[f32], inner: usize, m: usize, n: usize) -> Vec<f32> {
     let mut out = vec![0.0; m * n];
     matmul(

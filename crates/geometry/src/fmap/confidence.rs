@@ -79,7 +79,13 @@ impl Confidence {
         }
     }
 
-    /// The same everywhere, as where only the map as a whole is known.
+    /// The same everywhere, as where only the map as a whole is known; cut to 0 to 1.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::Confidence;
+    ///
+    /// assert_eq!(Confidence::uniform(1.0, 2).of_vertex, [255, 255]);
+    /// ```
     pub fn uniform(confidence: f64, n: usize) -> Self {
         let step = 1 + (STEPS * confidence.clamp(0.0, 1.0)).round() as u8;
         Self {
@@ -93,12 +99,30 @@ impl Confidence {
     }
 
     /// Probability that a label carried to a vertex is right; `None`: nothing corresponds.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::Confidence;
+    ///
+    /// let confidence = Confidence { of_vertex: vec![0, 1, 255] };
+    /// assert_eq!([0, 1, 2].map(|v| confidence.at(v)), [None, Some(0.0), Some(1.0)]);
+    /// assert!(!confidence.is_matched(0));
+    /// ```
+    ///
+    /// # Panics
+    /// If the vertex does not exist.
     pub fn at(&self, vertex: usize) -> Option<f64> {
         let step = self.of_vertex[vertex];
         (step > 0).then(|| f64::from(step - 1) / STEPS)
     }
 
-    /// Share of the mass `(n2,)` to which something corresponds.
+    /// Share of the mass `(n2,)` to which something corresponds, 0 to 1.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::Confidence;
+    ///
+    /// let confidence = Confidence { of_vertex: vec![0, 200] };
+    /// assert_eq!(confidence.matched_share(&[0.25, 0.75]), 0.75);
+    /// ```
     pub fn matched_share(&self, mass: &[f32]) -> f64 {
         let of = |matched: bool| -> f64 {
             let rows = mass.iter().zip(&self.of_vertex);

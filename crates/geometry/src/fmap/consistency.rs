@@ -34,7 +34,15 @@ pub struct Link<'a> {
 /// A map with the numbers of the shapes that it leads from and to: `c_12 (k_to, k_from)`, row-major.
 pub type Numbered = (usize, usize, Vec<f32>);
 
-/// Maps as links that are believed alike.
+/// Maps as links that are believed alike: weight 1 each.
+///
+/// ```
+/// use coseg_geometry::fmap::consistency::links;
+///
+/// let maps = [(0, 1, vec![1.0]), (1, 2, vec![-1.0])];
+/// let links = links(&maps);
+/// assert_eq!((links[1].from, links[1].to, links[1].weight), (1, 2, 1.0));
+/// ```
 pub fn links(maps: &[Numbered]) -> Vec<Link<'_>> {
     maps.iter()
         .map(|(from, to, c_12)| Link {

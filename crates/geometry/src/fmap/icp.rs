@@ -4,7 +4,26 @@ use super::basis::Basis;
 use super::convert::{functional, pointwise};
 use nalgebra::DMatrix;
 
-/// `rounds` times: pointwise map, functional map, nearest orthogonal one. `c_12 (k2, k1)` row-major.
+/// `rounds` times: pointwise map, functional map, nearest orthogonal one. `c_12 (k2, k1)`, and so
+/// the result, row-major. O(rounds n1 n2 k2).
+///
+/// ```
+/// use coseg_geometry::fmap::icp::icp;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 4, &Options::default())?;
+/// // A point reflection, disturbed, comes back as an exact one.
+/// let c = [1.0, 0., 0., 0., 0., -0.9, 0.1, 0., 0., 0., -1.1, 0., 0., 0., 0.05, -1.0];
+/// let found = icp(&sphere.basis(), &sphere.basis(), &c, 4, 5);
+/// for (i, x) in found.iter().enumerate() {
+///     let expected = if i == 0 { 1.0 } else if i % 5 == 0 { -1.0 } else { 0.0 };
+///     assert!((x - expected).abs() < 1e-3);
+/// }
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
+///
+/// # Panics
+/// If there are fewer than `k1` or `k2` eigenvectors.
 pub fn icp(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize, rounds: usize) -> Vec<f32> {
     let k2 = c_12.len() / k1.max(1);
     let mut c = c_12.to_vec();
@@ -15,7 +34,16 @@ pub fn icp(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize, rounds: us
     c
 }
 
-/// The matrix with orthonormal rows or columns, whichever are fewer, that is nearest to `c (k2, k1)`.
+/// The matrix with orthonormal rows or columns, whichever are fewer, that is nearest to `c (k2,
+/// k1)`; row-major.
+///
+/// ```
+/// use coseg_geometry::fmap::icp::nearest_orthogonal;
+///
+/// let found = nearest_orthogonal(&[3.0, 0.0, 0.0, -0.2], 2);
+/// let expected = [1.0, 0.0, 0.0, -1.0];
+/// assert!(found.iter().zip(expected).all(|(x, e)| (x - e).abs() < 1e-6));
+/// ```
 pub fn nearest_orthogonal(c: &[f32], k1: usize) -> Vec<f32> {
     let k2 = c.len() / k1.max(1);
     let svd = DMatrix::from_fn(k2, k1, |i, j| f64::from(c[i * k1 + j])).svd(true, true);

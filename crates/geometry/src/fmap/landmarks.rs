@@ -10,7 +10,20 @@ const TIMES: [f64; 3] = [2.0, 8.0, 32.0];
 /// Eigenpairs in use.
 const MAX_EIGENPAIRS: usize = 60;
 
-/// Logarithms of heat kernels from each of the `landmarks`, standardised: `(n, 3 landmarks)`.
+/// Logarithms of heat kernels from each of the `landmarks`, standardised: `(n, 3 landmarks)`. Each
+/// is greatest at its landmark.
+///
+/// ```
+/// use coseg_geometry::fmap::landmarks::landmark_probes;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 30, &Options::default())?;
+/// let probes = landmark_probes(&sphere.basis(), &[17]);
+/// assert_eq!((probes.dim, probes.values.len()), (3, 162 * 3));
+/// let hottest = (0..162).max_by(|a, b| probes.values[3 * a].total_cmp(&probes.values[3 * b]));
+/// assert_eq!(hottest, Some(17));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 ///
 /// # Panics
 /// If a landmark is not a vertex.

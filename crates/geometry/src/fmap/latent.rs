@@ -26,9 +26,24 @@ pub struct LatentBasis {
 }
 
 impl LatentBasis {
-    /// The `r` latent functions on which these maps agree best: `Σ w ‖C_ij Y_i − Y_j‖²` is least where
-    /// `Σ Y_iᵀ Y_i = n I`, with maps that depart from the rest losing weight. `eigenvalues` has for each shape those of
-    /// the eigenfunctions that the maps are between. O((Σ k)³).
+    /// The `r` latent functions on which these maps agree best: `Σ w ‖C_ij Y_i − Y_j‖²` is least
+    /// where `Σ Y_iᵀ Y_i = n I`, with maps that depart from the rest losing weight. `eigenvalues`
+    /// has for each shape those of the eigenfunctions that the maps are between. O((Σ k)³).
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::consistency::links;
+    /// use coseg_geometry::fmap::latent::LatentBasis;
+    ///
+    /// // Two shapes of two eigenfunctions each; the second has another sign on the second shape.
+    /// let (values, there) = ([0.0, 2.0], vec![1.0, 0.0, 0.0, -1.0]);
+    /// let maps = [(0, 1, there.clone()), (1, 0, there.clone())];
+    /// let basis = LatentBasis::solve(&[&values, &values], &links(&maps), 2)?;
+    /// assert_eq!((basis.n_shapes(), basis.n_functions()), (2, 2));
+    /// // The way by the latent functions is the map itself.
+    /// let through = basis.through(0, 1);
+    /// assert!(through.iter().zip(&there).all(|(x, y)| (x - y).abs() < 1e-5));
+    /// # Ok::<_, coseg_geometry::linalg::dense_eigen::DenseEigenError>(())
+    /// ```
     ///
     /// # Errors
     /// The dense eigen solver did not converge.

@@ -2,7 +2,18 @@
 
 use nalgebra::DMatrix;
 
-/// Multiplication by f `(n,)`: `Φᵀ A diag(f) Φ (k, k)` of eigenvectors `(n, k)`, mass `(n,)` (Nogneng and Ovsjanikov 2017).
+/// Multiplication by f `(n,)`: `Φᵀ A diag(f) Φ (k, k)` of eigenvectors `(n, k)`, mass `(n,)`
+/// (Nogneng and Ovsjanikov 2017).
+///
+/// ```
+/// use coseg_geometry::fmap::operators::multiplication;
+/// use nalgebra::DMatrix;
+///
+/// // Multiplication by 3 is three times the identity in an orthonormal basis.
+/// let basis = DMatrix::from_row_slice(2, 2, &[1.0, 1.0, 1.0, -1.0]);
+/// let found = multiplication(&basis, &[0.5, 0.5], &[3.0, 3.0]);
+/// assert_eq!(found, DMatrix::identity(2, 2) * 3.0);
+/// ```
 ///
 /// # Panics
 /// If lengths differ.
@@ -18,10 +29,22 @@ pub fn multiplication(eigenvectors: &DMatrix<f64>, mass: &[f64], f: &[f64]) -> D
     eigenvectors.transpose() * weighted
 }
 
-/// Crossing with the gradient of f `(n,)`: g becomes `n · (∇f × ∇g)`, `(k, k)` in the eigenvectors `(n, k)` of the mesh
-/// with these faces. Its sign changes with the orientation of the surface (Ren et al. 2018). O(m k²).
+/// Crossing with the gradient of f `(n,)`: g becomes `n · (∇f × ∇g)`, `(k, k)` in the eigenvectors
+/// `(n, k)` of the mesh with these faces. Its sign changes with the orientation of the surface (Ren
+/// et al. 2018). O(m k²).
 ///
-/// On a triangle the integral of that times ψ is `½ [(f₁ − f₀)(g₂ − g₀) − (f₂ − f₀)(g₁ − g₀)] (ψ₀ + ψ₁ + ψ₂)/3`.
+/// On a triangle the integral of that times ψ is
+/// `½ [(f₁ − f₀)(g₂ − g₀) − (f₂ − f₀)(g₁ − g₀)] (ψ₀ + ψ₁ + ψ₂)/3`.
+///
+/// ```
+/// use coseg_geometry::fmap::operators::crossing;
+/// use nalgebra::DMatrix;
+///
+/// // On a triangle f = x, g = y: n · (∇f × ∇g) is 1, and its integral the area.
+/// let basis = DMatrix::from_column_slice(3, 2, &[1.0, 1.0, 1.0, 0.0, 0.0, 1.0]); // 1 and y
+/// let found = crossing(&[[0, 1, 2]], &basis, &[0.0, 1.0, 0.0]);
+/// assert!((found[(0, 1)] - 0.5).abs() < 1e-12);
+/// ```
 ///
 /// # Panics
 /// If lengths differ or a face names a vertex that does not exist.

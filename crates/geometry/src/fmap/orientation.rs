@@ -119,9 +119,22 @@ impl Orientation {
         super::basis::product(&minors, &crossed, n, there, q)
     }
 
-    /// How a map from this shape to `other` agrees with orientation, −1 (reverses) to 1 (keeps): the cosine between
-    /// crossed functions that are carried, and carried functions that are crossed. 0 where nothing can be said.
-    /// `c_12 (rows, columns)` row-major.
+    /// How a map from this shape to `other` agrees with orientation, −1 (reverses) to 1 (keeps):
+    /// the cosine between crossed functions that are carried, and carried functions that are
+    /// crossed. 0 where nothing can be said. `c_12 (rows, columns)` row-major.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::orientation::Orientation;
+    /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+    ///
+    /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 4, &Options::default())?;
+    /// let sense = Orientation::new(&sphere.mesh.faces, &sphere.basis());
+    /// let identity = [1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0];
+    /// let reflection = [1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0];
+    /// assert!(sense.agreement(&sense, &identity, 4) > 0.99);
+    /// assert!(sense.agreement(&sense, &reflection, 4) < -0.99);
+    /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+    /// ```
     pub fn agreement(&self, other: &Self, c_12: &[f32], columns: usize) -> f64 {
         let rows = c_12.len() / columns.max(1);
         let (q1, q2) = (self.q.min(columns), other.q.min(rows));

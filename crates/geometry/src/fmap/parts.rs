@@ -89,7 +89,31 @@ impl<'a> MapShape<'a> {
 }
 
 /// The map from shape 1 to shape 2 (functions), with `p2p_21` from the vertices of 2 to those of 1.
-/// Costs about `2 n1 n2 (k + n_components)` flops, and a third of that for the rounds before the last.
+/// Costs about `2 n1 n2 (k + n_components)` flops, and a third of that for the rounds before the
+/// last.
+///
+/// ```
+/// use coseg_geometry::fmap::{MapOptions, MapShape, descriptor_zoomout};
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
+/// // Coordinates are descriptors that tell all points of a sphere apart.
+/// let place: Vec<f32> = sphere.mesh.vertices.as_flattened().iter().map(|x| *x as f32).collect();
+/// let (basis, faces) = (sphere.basis(), &sphere.mesh.faces);
+/// let shape = MapShape {
+///     eigenvalues: basis.eigenvalues,
+///     eigenvectors: basis.eigenvectors,
+///     n_eigenvectors: basis.n_eigenvectors,
+///     mass: basis.mass,
+///     faces,
+///     descriptors: &place,
+///     dim: 3,
+/// };
+/// let map = descriptor_zoomout(&shape, &shape, &MapOptions::default());
+/// assert!(map.p2p_21.iter().zip(0..).all(|(image, vertex)| *image == vertex));
+/// assert!(map.quality.orthogonality < 1e-3 && map.quality.coverage > 0.999);
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn descriptor_zoomout(
     one: &MapShape<'_>,
     two: &MapShape<'_>,
@@ -98,7 +122,34 @@ pub fn descriptor_zoomout(
     refined(one, two, None, options)
 }
 
-/// As [`descriptor_zoomout`], from a given map `c_12 (k, k1)`, row-major, in the place of nearest neighbours of descriptors.
+/// As [`descriptor_zoomout`], from a given map `c_12 (k, k1)`, row-major, in the place of nearest
+/// neighbours of descriptors.
+///
+/// ```
+/// use coseg_geometry::fmap::{MapOptions, MapShape, descriptor_zoomout_from};
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
+/// let (basis, faces) = (sphere.basis(), &sphere.mesh.faces);
+/// // A descriptor that tells nothing: the map is grown from the start alone, a point reflection.
+/// let shape = MapShape {
+///     eigenvalues: basis.eigenvalues,
+///     eigenvectors: basis.eigenvectors,
+///     n_eigenvectors: basis.n_eigenvectors,
+///     mass: basis.mass,
+///     faces,
+///     descriptors: &[1.0; 162],
+///     dim: 1,
+/// };
+/// let start = [1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0];
+/// let options = MapOptions::default();
+/// let map = descriptor_zoomout_from(&shape, &shape, (&start, 4), &options);
+/// let points = &sphere.mesh.vertices;
+/// for (p, image) in points.iter().zip(&map.p2p_21) {
+///     assert!((0..3).all(|i| (p[i] + points[*image as usize][i]).abs() < 1e-6));
+/// }
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 ///
 /// # Panics
 /// If a shape has fewer eigenvectors than the map.
@@ -111,8 +162,30 @@ pub fn descriptor_zoomout_from(
     refined(one, two, Some((c_12, k1)), options)
 }
 
-/// What a map is compared with: for each vertex of shape 2 the vertex of shape 1 with the nearest descriptors, and what to
-/// expect of that, as if it were a map.
+/// What a map is compared with: for each vertex of shape 2 `(n2,)` the vertex of shape 1 with the
+/// nearest descriptors, and what to expect of that, as if it were a map.
+///
+/// ```
+/// use coseg_geometry::fmap::{MapShape, nearest_descriptors};
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
+/// let (basis, faces) = (sphere.basis(), &sphere.mesh.faces);
+/// let place: Vec<f32> = sphere.mesh.vertices.as_flattened().iter().map(|x| *x as f32).collect();
+/// let shape = MapShape {
+///     eigenvalues: basis.eigenvalues,
+///     eigenvectors: basis.eigenvectors,
+///     n_eigenvectors: basis.n_eigenvectors,
+///     mass: basis.mass,
+///     faces,
+///     descriptors: &place,
+///     dim: 3,
+/// };
+/// let (p2p_21, confidence) = nearest_descriptors(&shape, &shape);
+/// assert!(p2p_21.iter().zip(0..).all(|(image, vertex)| *image == vertex));
+/// assert!(confidence.matched_share(basis.mass) > 0.99);
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn nearest_descriptors(one: &MapShape<'_>, two: &MapShape<'_>) -> (Vec<u32>, Confidence) {
     let (p2p_21, p2p_12) = nearest_both(two.descriptors, one.descriptors, one.dim);
     let k = 60.min(one.n_eigenvectors).min(two.n_eigenvectors).max(1);

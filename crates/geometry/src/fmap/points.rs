@@ -24,7 +24,8 @@ pub struct PointShape<'a> {
 }
 
 impl<'a> PointShape<'a> {
-    /// Samples, probe functions and sense of orientation of a shape: the same for all its maps.
+    /// Samples, probe functions and sense of orientation of a shape: the same for all its maps. The
+    /// shape has area 1 and total mass 1; its basis has as many rows as it has vertices.
     pub fn new(
         vertices: &'a [[f32; 3]],
         faces: &'a [[u32; 3]],
@@ -68,8 +69,11 @@ pub struct PointMap {
     pub cost: f64,
 }
 
-/// The map from shape 1 to shape 2 (functions), and after it, if `options` want it, the best one of the other
-/// orientation. `landmarks` are vertices of shape 1 and of shape 2 that correspond.
+/// The map from shape 1 to shape 2 (functions), and after it, if `options` want it, the best one of
+/// the other orientation. `landmarks` are vertices of shape 1 and of shape 2 that correspond. No
+/// start is random: the same shapes give the same maps.
+///
+/// See [`SpectralMesh::point_shape`](crate::SpectralMesh::point_shape) for an example.
 ///
 /// # Panics
 /// If a landmark is not a vertex.

@@ -18,7 +18,16 @@ pub struct PreciseMap {
 }
 
 impl PreciseMap {
-    /// Values `(n1, dim)` at the vertices of shape 1 with these faces become values `(n2, dim)`.
+    /// Values `(n1, dim)` at the vertices of shape 1 with these faces become values `(n2, dim)`,
+    /// interpolated linearly inside the faces.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::precise::PreciseMap;
+    ///
+    /// // One vertex of shape 2, mapped to the middle of an edge.
+    /// let map = PreciseMap { face: vec![0], barycentric: vec![[0.5, 0.5, 0.0]] };
+    /// assert_eq!(map.pulled_back(&[[0, 1, 2]], &[2.0, 4.0, 9.0], 1), [3.0]);
+    /// ```
     pub fn pulled_back(&self, faces: &[[u32; 3]], values: &[f32], dim: usize) -> Vec<f32> {
         let mut out = Vec::with_capacity(self.face.len() * dim);
         for (f, b) in self.face.iter().zip(&self.barycentric) {
@@ -30,7 +39,23 @@ impl PreciseMap {
     }
 }
 
-/// The precise map of `c_12 (k2, k1)`. `faces` are those of shape 1. O(n1 n2 k2).
+/// The precise map of `c_12 (k2, k1)`: for each vertex of shape 2 a point in a face of shape 1,
+/// whose `faces` are given. O(n1 n2 k2).
+///
+/// ```
+/// use coseg_geometry::fmap::precise::precise;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 4, &Options::default())?;
+/// let identity = [1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0];
+/// let basis = sphere.basis();
+/// let map = precise(&basis, &basis, &sphere.mesh.faces, &identity, 4);
+/// // Each vertex comes to lie where it is: in a corner of a face.
+/// let x: Vec<f32> = sphere.mesh.vertices.iter().map(|p| p[0] as f32).collect();
+/// let there = map.pulled_back(&sphere.mesh.faces, &x, 1);
+/// assert!(there.iter().zip(&x).all(|(a, b)| (a - b).abs() < 1e-4));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 ///
 /// # Panics
 /// If there is no face, or a vertex has none.

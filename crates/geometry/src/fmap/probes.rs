@@ -19,7 +19,16 @@ pub struct Probes {
 }
 
 impl Probes {
-    /// Both side by side; the others' mean square is `weight` times that of these.
+    /// Both side by side `(n, dim + others.dim)`; the mean square of the others is `weight` times
+    /// that of these. With a weight of 0 or less the others are left out.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::probes::Probes;
+    ///
+    /// let one = Probes { values: vec![1.0, -1.0], dim: 1 };
+    /// let both = one.clone().beside(&one, 1.0);
+    /// assert_eq!((both.dim, both.values), (2, vec![1.0, 1.0, -1.0, -1.0]));
+    /// ```
     pub fn beside(self, others: &Self, weight: f32) -> Self {
         let dim = self.dim + others.dim;
         if others.dim == 0 || weight <= 0.0 {
@@ -39,8 +48,24 @@ impl Probes {
     }
 }
 
-/// `n_energies` wave kernel and `n_times` heat kernel signatures, the latter as logarithms; mass-weighted mean 0 and
-/// variance 1 each.
+/// `n_energies` wave kernel and `n_times` heat kernel signatures `(n, n_energies + n_times)`, the
+/// latter as logarithms; mass-weighted mean 0 and variance 1 each. A function that is the same
+/// everywhere becomes 0.
+///
+/// ```
+/// use coseg_geometry::fmap::probes::probes;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let mut egg = icosphere(2);
+/// egg.vertices.iter_mut().for_each(|[x, _, z]| *z *= 2.0 + 0.3 * *x);
+/// let egg = SpectralMesh::new(egg, Operator::Tufted, 30, &Options::default())?;
+/// let found = probes(&egg.basis(), 4, 2);
+/// assert_eq!((found.dim, found.values.len()), (6, 162 * 6));
+/// let rows = found.values.chunks_exact(6).zip(egg.basis().mass);
+/// let variance: f32 = rows.map(|(row, mass)| mass * row[3] * row[3]).sum();
+/// assert!((variance - 1.0).abs() < 1e-3);
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn probes(basis: &Basis<'_>, n_energies: usize, n_times: usize) -> Probes {
     let k = basis.n_eigenvectors.min(MAX_EIGENPAIRS);
     let values = &basis.eigenvalues[..k];
@@ -67,10 +92,26 @@ pub fn probes(basis: &Basis<'_>, n_energies: usize, n_times: usize) -> Probes {
     Probes { values, dim }
 }
 
-/// Mean curvature of the surface `vertices (n, 3)`, `faces (m, 3)`, smoothed to `n_scales` degrees: positive where it
-/// bulges outward, so that it tells a chest from a back, which no intrinsic function does. Standardised as above.
+/// Mean curvature of the surface `vertices (n, 3)`, `faces (m, 3)`, smoothed to `n_scales` degrees
+/// `(n, n_scales)`: positive where it bulges outward, so that it tells a chest from a back, which
+/// no intrinsic function does. Mass-weighted mean 0 and variance 1 each.
 ///
 /// `Δx = 2 H n`, with coordinates x in the eigenbasis damped by `exp(−λ t)`.
+///
+/// ```
+/// use coseg_geometry::fmap::probes::curvature_probes;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let mut egg = icosphere(2);
+/// egg.vertices.iter_mut().for_each(|[_, _, z]| *z *= 2.0);
+/// let egg = SpectralMesh::new(egg, Operator::Tufted, 60, &Options::default())?;
+/// let points: Vec<[f32; 3]> = egg.mesh.vertices.iter().map(|p| p.map(|x| x as f32)).collect();
+/// let found = curvature_probes(&points, &egg.mesh.faces, &egg.basis(), 1);
+/// // An ellipsoid is most curved at its ends.
+/// let most = (0..162).max_by(|a, b| found.values[*a].total_cmp(&found.values[*b])).unwrap();
+/// assert!(points[most][2].abs() > 0.9 * points.iter().fold(0.0, |m, p| p[2].max(m)));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 pub fn curvature_probes(
     vertices: &[[f32; 3]],
     faces: &[[u32; 3]],
@@ -137,7 +178,14 @@ fn outward_normals(vertices: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[f32; 3]> {
     normals
 }
 
-/// Makes the mass-weighted mean of each column 0 and its variance 1; a constant column becomes 0.
+/// Makes the mass-weighted mean of each column of `values (n, dim)` 0 and its variance 1, with the
+/// `mass (n,)`; a constant column becomes 0.
+///
+/// ```
+/// let mut values = [1.0, 5.0, 3.0, 5.0]; // two rows; the second column is constant
+/// coseg_geometry::fmap::probes::standardise(&mut values, 2, &[0.5, 0.5]);
+/// assert_eq!(values, [-1.0, 0.0, 1.0, 0.0]);
+/// ```
 pub fn standardise(values: &mut [f32], dim: usize, mass: &[f32]) {
     let total: f64 = mass.iter().map(|m| f64::from(*m)).sum();
     let (mut mean, mut square) = (vec![0.0f64; dim], vec![0.0f64; dim]);

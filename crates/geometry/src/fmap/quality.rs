@@ -35,7 +35,22 @@ pub struct Assessment {
 }
 
 impl Quality {
-    /// What a map `c_12 (k2, k1)` and its pointwise map say by themselves; what takes descriptors stays 0.
+    /// What a map `c_12 (k2, k1)` and its pointwise map `p2p_21 (n2,)` say by themselves, with the
+    /// mass `(n1,)` of shape 1; what takes descriptors stays 0.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::Quality;
+    ///
+    /// // The identity on four vertices, and a map that takes all of them to one.
+    /// let (mass, identity) = ([0.25; 4], [1.0, 0.0, 0.0, 1.0]);
+    /// let good = Quality::of_map(&mass, &identity, 2, &[0, 1, 2, 3]);
+    /// assert_eq!((good.orthogonality, good.coverage), (0.0, 1.0));
+    /// let collapsed = Quality::of_map(&mass, &[1.0, 0.0, 0.0, 0.0], 2, &[3, 3, 3, 3]);
+    /// assert_eq!((collapsed.orthogonality, collapsed.coverage), (0.5f64.sqrt(), 0.25));
+    /// ```
+    ///
+    /// # Panics
+    /// If the map names a vertex that does not exist.
     pub fn of_map(mass_1: &[f32], c_12: &[f32], k1: usize, p2p_21: &[u32]) -> Self {
         let k2 = c_12.len() / k1.max(1);
         let gram = transposed_product(c_12, c_12, k2, k1, k1);
@@ -64,8 +79,23 @@ impl Quality {
 }
 
 impl Assessment {
-    /// Of a map between shapes of area 1, between whose samples the maps there and back are `p2p_21` and `p2p_12`, and all
-    /// of whose vertices are mapped by `dense_21`.
+    /// Of a map between shapes of area 1, between whose samples the maps there and back are
+    /// `p2p_21` and `p2p_12`, and all of whose vertices are mapped by `dense_21 (n2,)`.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::{Assessment, samples::farthest_point_samples};
+    /// use coseg_geometry::mesh::{EdgeGraph, icosphere};
+    ///
+    /// let sphere = icosphere(1);
+    /// let graph = EdgeGraph::new(&sphere, &[]);
+    /// let samples = farthest_point_samples(&graph, &[1.0 / 42.0; 42], &[10]).remove(0);
+    /// let vertices: Vec<[f32; 3]> = sphere.vertices.iter().map(|p| p.map(|x| x as f32)).collect();
+    /// let all: Vec<u32> = (0..42).collect();
+    /// let identity = (&all[..10], &all[..10]);
+    /// let faces = &sphere.faces[..];
+    /// let found = Assessment::new((&vertices, &samples), (&vertices, faces), identity, &all);
+    /// assert_eq!((found.round_trip, found.smoothness), (0.0, 1.0));
+    /// ```
     pub fn new(
         one: (&[[f32; 3]], &Samples),
         two: (&[[f32; 3]], &[[u32; 3]]),

@@ -18,8 +18,23 @@ pub struct Samples {
     pub nearest: Vec<u32>,
 }
 
-/// The first `count` samples (or all vertices, if there are fewer) for each of the ascending `counts`, by distance
-/// along edges, from the vertex that is farthest from the first one. O(n count) in the worst case, with a small constant.
+/// The first `count` samples (or all vertices, if there are fewer) for each of the ascending
+/// `counts`, by distance along edges, from the vertex that is farthest from the first one. Masses
+/// are those of the vertices `(n,)`, summed over cells. O(n count) in the worst case, with a small
+/// constant.
+///
+/// ```
+/// use coseg_geometry::fmap::samples::farthest_point_samples;
+/// use coseg_geometry::mesh::{EdgeGraph, icosphere};
+///
+/// let sphere = icosphere(2);
+/// let found = farthest_point_samples(&EdgeGraph::new(&sphere, &[]), &[1.0; 162], &[2, 10]);
+/// // The first two are opposite, and are also the first two of ten.
+/// let [a, b] = [0, 1].map(|i| sphere.vertices[found[0].vertices[i] as usize]);
+/// assert!((0..3).all(|i| (a[i] + b[i]).abs() < 0.5));
+/// assert_eq!(found[1].vertices[..2], found[0].vertices);
+/// assert_eq!(found[1].mass.iter().sum::<f32>(), 162.0);
+/// ```
 pub fn farthest_point_samples(graph: &EdgeGraph, mass: &[f32], counts: &[usize]) -> Vec<Samples> {
     let n = mass.len();
     let mut distances = Distances::default();
@@ -83,8 +98,23 @@ pub struct SampledBasis {
 }
 
 impl SampledBasis {
-    /// At the given vertices with their masses; fewer columns if there are fewer eigenvectors, or if so few
-    /// samples do not tell them apart.
+    /// At the given vertices with their masses; fewer columns if there are fewer eigenvectors, or
+    /// if so few samples do not tell them apart.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::samples::SampledBasis;
+    /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+    ///
+    /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 9, &Options::default())?;
+    /// let every_third: Vec<u32> = (0..162).step_by(3).collect();
+    /// let sampled = SampledBasis::new(&sphere.basis(), &every_third, &[1.0; 54], 9);
+    /// assert_eq!((sampled.n, sampled.k), (54, 9));
+    /// // An eigenfunction is found again by its values at the samples.
+    /// let second: Vec<f32> = sampled.rows.chunks_exact(9).map(|row| row[1]).collect();
+    /// let coefficients = sampled.fit(&second, 1, 9);
+    /// assert!((coefficients[1] - 1.0).abs() < 1e-3 && coefficients[2].abs() < 1e-3);
+    /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+    /// ```
     pub fn new(basis: &Basis<'_>, vertices: &[u32], mass: &[f32], k: usize) -> Self {
         let k = k.min(basis.n_eigenvectors).min(vertices.len()).max(1);
         let rows = basis.rows(vertices, k);
@@ -129,7 +159,8 @@ impl SampledBasis {
         columns(&self.rows, self.k, k)
     }
 
-    /// Coefficients `(k, dim)` of functions given at the samples `(n, dim)`, by least squares.
+    /// Coefficients `(k, dim)` of functions given at the samples `(n, dim)`, by least squares
+    /// weighted by mass. See [`SampledBasis::new`] for an example.
     pub fn fit(&self, values: &[f32], dim: usize, k: usize) -> Vec<f32> {
         let weighted = columns(&self.weighted, self.k, k);
         let right = super::basis::transposed_product(&weighted, values, self.n, k, dim);

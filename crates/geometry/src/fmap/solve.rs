@@ -57,7 +57,10 @@ const TOLERANCE: f64 = 1e-12;
 const LIMIT: f64 = 1e-8;
 
 impl Energy {
-    /// Its value at C `(k2, k1)`.
+    /// The value of the energy at C `(k2, k1)`; not negative.
+    ///
+    /// # Panics
+    /// If sizes do not fit.
     pub fn value(&self, c: &DMatrix<f64>) -> f64 {
         let fit = (c * &self.probes_1 - &self.probes_2).norm_squared();
         let mask: f64 = c.iter().zip(&self.mask).map(|(x, m)| m * x * x).sum();
@@ -77,7 +80,28 @@ impl Energy {
         out
     }
 
-    /// The minimiser among maps with this first column `(k2,)`. O(k2 k1³), or with operators O(p k³) an iteration.
+    /// The minimiser `(k2, k1)` among maps with this first column `(k2,)`. O(k2 k1³), or with
+    /// operators O(p k³) an iteration.
+    ///
+    /// ```
+    /// use coseg_geometry::fmap::solve::{Energy, laplacian_mask};
+    /// use nalgebra::{DMatrix, DVector};
+    ///
+    /// // A function that is the second eigenfunction of shape 1, and minus that of shape 2.
+    /// let spectrum = [0.0, 2.0, 6.0];
+    /// let energy = Energy {
+    ///     probes_1: DMatrix::from_column_slice(3, 1, &[0.0, 1.0, 0.0]),
+    ///     probes_2: DMatrix::from_column_slice(3, 1, &[0.0, -1.0, 0.0]),
+    ///     probe_weight: 1.0,
+    ///     mask: laplacian_mask(&spectrum, &spectrum).add_scalar(1e-6),
+    ///     mask_weight: 1e-3,
+    ///     operators: Vec::new(),
+    /// };
+    /// let c = energy.minimiser(&DVector::from_column_slice(&[1.0, 0.0, 0.0]))?;
+    /// assert!((c[(1, 1)] + 1.0).abs() < 1e-6 && c[(2, 2)].abs() < 1e-6);
+    /// assert!(energy.value(&c) < energy.value(&DMatrix::identity(3, 3)));
+    /// # Ok::<_, coseg_geometry::fmap::solve::SolveError>(())
+    /// ```
     ///
     /// # Errors
     /// See [`SolveError`].
@@ -195,7 +219,14 @@ impl Energy {
     }
 }
 
-/// `(λ_1j − λ_2i)²`, with the sum over all entries 1: `(k2, k1)`.
+/// `(λ_1j − λ_2i)²`, with the sum over all entries 1: `(k2, k1)`. It is 0 where the spectra agree,
+/// so that it costs a map to mix frequencies. All 0 if all eigenvalues are equal.
+///
+/// ```
+/// let mask = coseg_geometry::fmap::solve::laplacian_mask(&[0.0, 1.0], &[0.0, 1.0, 1.0]);
+/// assert_eq!(mask.shape(), (3, 2));
+/// assert_eq!((mask[(1, 1)], mask[(1, 0)]), (0.0, 1.0 / 3.0));
+/// ```
 pub fn laplacian_mask(values_1: &[f64], values_2: &[f64]) -> DMatrix<f64> {
     let mask = DMatrix::from_fn(values_2.len(), values_1.len(), |i, j| {
         (values_1[j] - values_2[i]).powi(2)
@@ -204,8 +235,15 @@ pub fn laplacian_mask(values_1: &[f64], values_2: &[f64]) -> DMatrix<f64> {
     if sum > 0.0 { mask / sum } else { mask }
 }
 
-/// Squared distance of the resolvents `(Δ^γ − i)⁻¹`, both spectra divided by the largest eigenvalue: bounded, and so
-/// independent of k in scale (Ren et al. 2019); `(k2, k1)`.
+/// Squared distance of the resolvents `(Δ^γ − i)⁻¹`, both spectra divided by the largest
+/// eigenvalue: bounded, and so independent of k in scale (Ren et al. 2019); `(k2, k1)`.
+///
+/// ```
+/// let mask = coseg_geometry::fmap::solve::resolvent_mask(&[0.0, 9.0], &[0.0, 9.0], 0.5);
+/// // Frequencies that agree cost nothing, others at most 1.
+/// assert_eq!((mask[(0, 0)], mask[(1, 1)]), (0.0, 0.0));
+/// assert!((mask[(0, 1)] - 0.5).abs() < 1e-12);
+/// ```
 pub fn resolvent_mask(values_1: &[f64], values_2: &[f64], gamma: f64) -> DMatrix<f64> {
     let all = values_1.iter().chain(values_2);
     let largest = all.fold(f64::MIN_POSITIVE, |m, x| m.max(x.abs()));

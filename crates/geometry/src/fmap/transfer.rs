@@ -2,7 +2,15 @@
 
 use super::basis::{Basis, product};
 
-/// Values `(n1, dim)` at the vertices of shape 1 become values `(n2, dim)` at those of shape 2, vertex by vertex.
+/// Values `(n1, dim)` at the vertices of shape 1 become values `(n2, dim)` at those of shape 2,
+/// vertex by vertex: `values[p2p_21]`.
+///
+/// ```
+/// use coseg_geometry::fmap::transfer::pulled_back;
+///
+/// // Vertices 0 and 1 of shape 2 correspond to vertex 2 of shape 1.
+/// assert_eq!(pulled_back(&[2, 2, 0], &["head", "arm", "foot"], 1), ["foot", "foot", "head"]);
+/// ```
 ///
 /// # Panics
 /// If the map names a vertex that does not exist.
@@ -14,8 +22,25 @@ pub fn pulled_back<T: Copy>(p2p_21: &[u32], values: &[T], dim: usize) -> Vec<T> 
     out
 }
 
-/// Values `(n1, dim)` carried as functions: projected onto the first `k1` eigenfunctions, mapped by `c_12 (k2, k1)`,
-/// evaluated `(n2, dim)`. Smooth, and blind to detail that the basis does not hold.
+/// Values `(n1, dim)` carried as functions: projected onto the first `k1` eigenfunctions, mapped by
+/// `c_12 (k2, k1)`, evaluated `(n2, dim)`. Smooth, and blind to detail that the basis does not
+/// hold.
+///
+/// ```
+/// use coseg_geometry::fmap::transfer::carried;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 4, &Options::default())?;
+/// let height: Vec<f32> = sphere.mesh.vertices.iter().map(|p| p[2] as f32).collect();
+/// // The point reflection turns height over.
+/// let c = [1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0];
+/// let found = carried(&sphere.basis(), &sphere.basis(), &c, 4, &height, 1);
+/// assert!(found.iter().zip(&height).all(|(x, z)| (x + z).abs() < 0.01));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
+///
+/// # Panics
+/// If there are fewer than `k1` or `k2` eigenvectors.
 pub fn carried(
     one: &Basis<'_>,
     two: &Basis<'_>,
@@ -30,9 +55,22 @@ pub fn carried(
     product(&two.leading(k2), &mapped, two.n_vertices(), k2, dim)
 }
 
-/// Values at faces `(m1, dim)` of shape 1 become values at faces `(m2, dim)` of shape 2: of each face, the mean over its
-/// corners of the mean over the faces around the matched vertices. Labels and other classes go as indicators. `matched
-/// (n2,)` says to which vertices something corresponds; a face with fewer than two such corners gets NaN.
+/// Values at faces `(m1, dim)` of shape 1, which has `n_1` vertices, become values at faces `(m2,
+/// dim)` of shape 2: of each face, the mean over its corners of the mean over the faces around the
+/// matched vertices. Labels and other classes go as indicators. `matched (n2,)` says to which
+/// vertices something corresponds; a face with fewer than two such corners gets NaN.
+///
+/// ```
+/// use coseg_geometry::fmap::transfer::faces_to_faces;
+///
+/// let (faces, identity) = ([[0, 1, 2], [2, 1, 3]], [0, 1, 2, 3]);
+/// let found = faces_to_faces(&faces, &faces, 4, &identity, &[true; 4], &[0.0, 1.0], 1);
+/// // Corners 1 and 2 are shared, and have the mean of both faces.
+/// assert!((found[0] - 1.0 / 3.0).abs() < 1e-6 && (found[1] - 2.0 / 3.0).abs() < 1e-6);
+/// let matched = [true, false, false, true];
+/// let nothing = faces_to_faces(&faces, &faces, 4, &identity, &matched, &[0.0, 1.0], 1);
+/// assert!(nothing.iter().all(|x| x.is_nan()));
+/// ```
 pub fn faces_to_faces(
     faces_1: &[[u32; 3]],
     faces_2: &[[u32; 3]],
@@ -72,8 +110,18 @@ pub fn faces_to_faces(
     out
 }
 
-/// The label of each face of shape 2 `(m2,)` that most of the faces around the vertices matched to its corners have;
-/// the lowest on ties; −1 where nothing corresponds.
+/// The label of each face of shape 2 `(m2,)` that most of the faces around the vertices matched to
+/// its corners have; the lowest on ties; −1 where nothing corresponds (see [`faces_to_faces`]).
+///
+/// ```
+/// use coseg_geometry::fmap::transfer::labels_to_faces;
+///
+/// // A strip of four triangles, mapped onto itself the other way round.
+/// let faces = [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]];
+/// let turned = [5, 4, 3, 2, 1, 0];
+/// let found = labels_to_faces(&faces, &faces, 6, &turned, &[true; 6], &[7, 7, 2, 2]);
+/// assert_eq!(found, [2, 2, 7, 7]);
+/// ```
 pub fn labels_to_faces(
     faces_1: &[[u32; 3]],
     faces_2: &[[u32; 3]],

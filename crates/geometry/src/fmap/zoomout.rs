@@ -5,8 +5,25 @@ use super::convert::{functional, pointwise};
 use super::samples::{SampledBasis, columns};
 use crate::linalg::nearest::nearest_rows;
 
-/// ZoomOut as published, on all vertices: `rounds` times a pointwise map and a functional map that is larger by `step`;
-/// then the pointwise map of the last. `c_12` is `(k, k)`, row-major. O(rounds n1 n2 k).
+/// ZoomOut as published, on all vertices: `rounds` times a pointwise map and a functional map that
+/// is larger by `step`; then the pointwise map of the last. `c_12` is `(k, k)`, row-major, and so
+/// is the result, with `k + rounds step` rows; `p2p_21 (n2,)` gives for each vertex of shape 2 a
+/// vertex of shape 1. O(rounds n1 n2 k).
+///
+/// ```
+/// use coseg_geometry::fmap::zoomout;
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
+/// // A point reflection, known by three coordinates alone, grows to sixteen eigenfunctions.
+/// let small = [1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0];
+/// let (large, p2p_21) = zoomout(&sphere.basis(), &sphere.basis(), &small, 4, 4, 3);
+/// assert_eq!((large.len(), p2p_21.len()), (16 * 16, 162));
+/// // Of degree 2 are five even functions, of degree 3 seven odd ones.
+/// assert!((4..9).all(|i| (large[17 * i] - 1.0).abs() < 1e-3));
+/// assert!((9..16).all(|i| (large[17 * i] + 1.0).abs() < 1e-3));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
 ///
 /// # Panics
 /// If there are fewer than `k + rounds step` eigenvectors.
@@ -28,8 +45,28 @@ pub fn zoomout(
     (c, p2p_21)
 }
 
-/// ZoomOut on samples, through the sizes `ks`: of `c_12 (k, k)`, a map of the last size. Functional maps by weighted
-/// least squares at the samples.
+/// ZoomOut on samples, through the sizes `ks`: of `c_12 (k, k)`, a map of the last size, row-major.
+/// Functional maps are fitted by weighted least squares at the samples.
+///
+/// ```
+/// use coseg_geometry::fmap::samples::{SampledBasis, farthest_point_samples};
+/// use coseg_geometry::fmap::zoomout_sampled;
+/// use coseg_geometry::mesh::{EdgeGraph, icosphere};
+/// use coseg_geometry::{SpectralMesh, operators::Operator, spectrum::Options};
+///
+/// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 16, &Options::default())?;
+/// let graph = EdgeGraph::new(&sphere.mesh, &[]);
+/// let samples = farthest_point_samples(&graph, sphere.basis().mass, &[100]).remove(0);
+/// let sampled = SampledBasis::new(&sphere.basis(), &samples.vertices, &samples.mass, 16);
+/// // The identity of the sphere stays the identity.
+/// let small = [1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0, 0., 0., 0., 0., 1.0];
+/// let large = zoomout_sampled(&sampled, &sampled, &small, 4, &[9, 16]);
+/// assert!((0..16).all(|i| (large[17 * i] - 1.0).abs() < 1e-3));
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
+///
+/// # Panics
+/// If a size is larger than the number of columns of a sampled basis.
 pub fn zoomout_sampled(
     one: &SampledBasis,
     two: &SampledBasis,

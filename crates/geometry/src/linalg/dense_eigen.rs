@@ -12,8 +12,17 @@ pub struct DenseEigenError {
     pub n: usize,
 }
 
-/// Eigenvalues `(n,)` ascending and eigenvectors `(n, n)`, column-major, of the symmetric matrix
-/// `a (n, n)`, of which the lower triangle is read. One thread; O(n³).
+/// Eigenvalues `(n,)` ascending and orthonormal eigenvectors `(n, n)`, column-major, of the
+/// symmetric matrix `a (n, n)`, of which the lower triangle is read. One thread; O(n³).
+///
+/// ```
+/// use coseg_geometry::linalg::dense_eigen::symmetric_eigen;
+///
+/// let (values, vectors) = symmetric_eigen(&[2.0, -1.0, -1.0, 2.0], 2)?;
+/// assert!((values[0] - 1.0).abs() < 1e-12 && (values[1] - 3.0).abs() < 1e-12);
+/// assert!((vectors[(0, 0)] - vectors[(1, 0)]).abs() < 1e-12);
+/// # Ok::<_, coseg_geometry::linalg::dense_eigen::DenseEigenError>(())
+/// ```
 pub fn symmetric_eigen(a: &[f64], n: usize) -> Result<(Vec<f64>, Mat<f64>), DenseEigenError> {
     let a = MatRef::from_column_major_slice(a, n, n);
     let mut values = Mat::<f64>::zeros(n, 1);

@@ -4,9 +4,21 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
 /// Clusters the rows of `points (n, dim)`, row-major, into `k` clusters, and returns the cluster of
-/// each row `(n,)`. The best of `n_starts` seeded starts by the weighted sum of squared distances
-/// wins; a cluster that runs empty is restarted at the row farthest from its centre. With `k >= n`
-/// every row is its own cluster. Costs `O(n k dim)` an iteration.
+/// each row `(n,)`. The best of `n_starts` seeded starts by the sum of squared distances, each
+/// times its weight `(n,)`, wins; a cluster that runs empty is restarted at the row farthest from
+/// its centre. With `k >= n` every row is its own cluster. Costs `O(n k dim)` an iteration.
+///
+/// ```
+/// use coseg_geometry::linalg::kmeans::kmeans;
+///
+/// let points = [0.0, 0.1, 0.2, 9.0, 9.1]; // on a line
+/// let found = kmeans(&points, 1, &[1.0; 5], 2, 7, 3);
+/// assert_eq!([found[1], found[2], found[4]], [found[0], found[0], found[3]]);
+/// assert_ne!(found[0], found[3]);
+/// ```
+///
+/// # Panics
+/// If `points` does not hold n rows of `dim` values.
 pub fn kmeans(
     points: &[f64],
     dim: usize,

@@ -8,8 +8,18 @@ use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use sprs::CsMat;
 
 /// The `k` algebraically largest eigenvalues of `matrix (n, n)`, descending, and their eigenvectors
-/// `(n, k)`, orthonormal, each with its entry of largest magnitude positive. Started from the constant
-/// vector plus a fixed small perturbation, so the result is deterministic. `k` is cut to `n`.
+/// `(n, k)`, orthonormal, each with its entry of largest magnitude positive. Started from the
+/// constant vector plus a fixed small perturbation, so the result is deterministic. `k` is cut to
+/// `n`.
+///
+/// ```
+/// use coseg_geometry::linalg::lanczos_top::largest_eigenpairs;
+///
+/// let identity = sprs::CsMat::<f64>::eye(3);
+/// let (values, vectors) = largest_eigenpairs(&identity, 5);
+/// assert!(values.iter().all(|x| (x - 1.0).abs() < 1e-12));
+/// assert_eq!(vectors.shape(), (3, 3));
+/// ```
 pub fn largest_eigenpairs(matrix: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f64>) {
     let n = matrix.rows();
     let k = k.min(n);

@@ -72,6 +72,17 @@ impl SymmetricSparse {
     }
 
     /// `P M Pᵀ`: row `i` of the result is row `order[i]` of this matrix.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::ldlt::SymmetricSparse;
+    ///
+    /// let diagonal = SymmetricSparse {
+    ///     row_starts: vec![0, 1, 2],
+    ///     columns: vec![0, 1],
+    ///     values: vec![5.0, 7.0],
+    /// };
+    /// assert_eq!(diagonal.permuted(&[1, 0]).values, [7.0, 5.0]);
+    /// ```
     pub fn permuted(&self, order: &[u32]) -> Self {
         let mut rank = vec![0u32; self.n()];
         for (new, &old) in order.iter().enumerate() {
@@ -111,7 +122,25 @@ pub struct Analysis {
 }
 
 impl Analysis {
-    /// Orders and analyses the pattern of `matrix`.
+    /// Orders and analyses the pattern of `matrix` `(n, n)`; its values do not matter.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::ldlt::{Analysis, SymmetricSparse};
+    ///
+    /// let matrix = SymmetricSparse {
+    ///     row_starts: vec![0, 2, 4],
+    ///     columns: vec![0, 1, 0, 1],
+    ///     values: vec![2.0, -1.0, -1.0, 2.0],
+    /// };
+    /// let analysis = Analysis::new(&matrix)?;
+    /// let mut order = analysis.order.clone();
+    /// order.sort_unstable();
+    /// assert_eq!(order, [0, 1]);
+    /// # Ok::<_, coseg_geometry::linalg::ldlt::LdltError>(())
+    /// ```
+    ///
+    /// # Errors
+    /// Too many rows or entries, or too little memory.
     pub fn new(matrix: &SymmetricSparse) -> Result<Self, LdltError> {
         let n = matrix.n();
         let failed = |reason: String| LdltError::Symbolic {

@@ -22,6 +22,18 @@ const ORPHAN: u32 = u32::MAX - 2;
 
 impl Network {
     /// A network of `n` nodes and no arcs.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::maxflow::Network;
+    ///
+    /// // Nodes 0 and 2 want to be apart; the weaker of the two edges between them is cut.
+    /// let mut network = Network::new(3);
+    /// network.terminal(0, 10, 0);
+    /// network.terminal(2, 0, 10);
+    /// network.edge(0, 1, 3, 3);
+    /// network.edge(1, 2, 2, 2);
+    /// assert_eq!(network.sink_side(), [false, false, true]);
+    /// ```
     pub fn new(n: usize) -> Self {
         Self {
             edges: Vec::new(),
@@ -29,7 +41,11 @@ impl Network {
         }
     }
 
-    /// Arcs `from → to` and `to → from` with the given capacities.
+    /// Arcs `from → to` and `to → from` with the given capacities: what the cut costs if `from` is
+    /// on the source side and `to` on the sink side, and the other way round. A loop is left out.
+    ///
+    /// # Panics
+    /// If a capacity is negative.
     pub fn edge(&mut self, from: usize, to: usize, forward: i64, backward: i64) {
         assert!(forward >= 0 && backward >= 0, "capacities are not negative");
         if from != to && (forward > 0 || backward > 0) {
@@ -37,13 +53,26 @@ impl Network {
         }
     }
 
-    /// The cost of `node` being on the sink side and on the source side of the cut.
+    /// Adds to the cost of `node` being on the sink side and on the source side of the cut. Only
+    /// the difference of the two matters.
+    ///
+    /// # Panics
+    /// If the node does not exist.
     pub fn terminal(&mut self, node: usize, on_sink_side: i64, on_source_side: i64) {
         self.terminal[node] += on_sink_side - on_source_side;
     }
 
-    /// Maximises the flow and returns, for each node, whether it is on the sink side of the minimum
-    /// cut that has the fewest nodes on the source side.
+    /// Maximises the flow and returns, for each node `(n,)`, whether it is on the sink side of the
+    /// minimum cut that has the fewest nodes on the source side: a node that nothing ties to either
+    /// side is on the sink side.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::maxflow::Network;
+    ///
+    /// let mut network = Network::new(2);
+    /// network.terminal(0, 1, 0); // on the sink side node 0 would cost 1
+    /// assert_eq!(network.sink_side(), [false, true]);
+    /// ```
     pub fn sink_side(self) -> Vec<bool> {
         let mut search = Search::new(&self);
         search.run();

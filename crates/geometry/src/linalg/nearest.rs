@@ -11,6 +11,13 @@ const BLOCK: usize = 256;
 /// For each row of `queries (q, dim)` the index of the nearest row of `targets (t, dim)` in the
 /// Euclidean norm, both row-major; ties go to the lowest index. Costs `2 q t dim` flops.
 ///
+/// ```
+/// use coseg_geometry::linalg::nearest::nearest_rows;
+///
+/// let targets = [0.0, 0.0, 1.0, 0.0, 0.0, 1.0];
+/// assert_eq!(nearest_rows(&[0.9, 0.2, -3.0, -3.0], &targets, 2), [1, 0]);
+/// ```
+///
 /// # Panics
 /// If `targets` is empty or a length is not a multiple of `dim`.
 pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
@@ -27,8 +34,16 @@ pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
     nearest
 }
 
-/// As [`nearest_rows`], in both directions for the products of one: the nearest target of each query `(q,)` and
-/// the nearest query of each target `(t,)`.
+/// As [`nearest_rows`], in both directions for the products of one: the nearest target of each
+/// query `(q,)` and the nearest query of each target `(t,)`.
+///
+/// ```
+/// use coseg_geometry::linalg::nearest::nearest_both;
+///
+/// let (of_query, of_target) = nearest_both(&[0.0, 10.0], &[9.0, 6.0, 1.0], 1);
+/// assert_eq!(of_query, [2, 0]);
+/// assert_eq!(of_target, [1, 1, 0]);
+/// ```
 ///
 /// # Panics
 /// If one side is empty or a length is not a multiple of `dim`.
@@ -57,9 +72,18 @@ pub fn nearest_both(queries: &[f32], targets: &[f32], dim: usize) -> (Vec<u32>, 
     (of_query, of_target)
 }
 
-/// As [`nearest_rows`], but targets are in cells `(t,)`, each with a centre that is a target, and only the
-/// `n_probed` cells with the nearest centres are searched (all, if there are no more). Near enough to exact where
-/// cells are small; costs `2 q (cells + n_probed t / cells) dim` flops.
+/// As [`nearest_rows`], but targets are in cells `(t,)`, each with a centre that is a target, and
+/// only the `n_probed` cells with the nearest centres are searched (all, if there are no more).
+/// Near enough to exact where cells are small; costs `2 q (cells + n_probed t / cells) dim` flops.
+///
+/// ```
+/// use coseg_geometry::linalg::nearest::nearest_in_cells;
+///
+/// // Two cells about targets 1 and 4; only the nearer one is searched.
+/// let targets = [0.0, 1.0, 2.0, 10.0, 11.0, 12.0];
+/// let cell = [0, 0, 0, 1, 1, 1];
+/// assert_eq!(nearest_in_cells(&[2.2, 9.0], &targets, 1, &[1, 4], &cell, 1), [2, 3]);
+/// ```
 ///
 /// # Panics
 /// If `targets` is empty, a length is not a multiple of `dim` or a centre or cell does not exist.

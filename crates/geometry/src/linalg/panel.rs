@@ -49,6 +49,13 @@ pub type Tile = [Row; WIDTH];
 pub const ZERO_TILE: Tile = [Row::ZERO; WIDTH];
 
 /// A panel of zeros with `n` rows and padding.
+///
+/// ```
+/// use coseg_geometry::linalg::panel::{PADDING, zero_panel};
+///
+/// assert_eq!(zero_panel(3).len(), PADDING);
+/// assert_eq!(zero_panel(PADDING + 1).len(), 2 * PADDING);
+/// ```
 pub fn zero_panel(n: usize) -> Vec<Row> {
     vec![Row::ZERO; n.next_multiple_of(PADDING)]
 }
@@ -79,7 +86,16 @@ pub fn tile_product(a: &Tile, b: &Tile) -> Tile {
     c
 }
 
-/// `VᵀW` of two panels.
+/// `VᵀW` of two panels with as many rows. `parallel`: slabs of rows are shared among the caller's
+/// rayon pool, with the same bits.
+///
+/// ```
+/// use coseg_geometry::linalg::panel::{Row, gram, zero_panel};
+///
+/// let mut v = zero_panel(3);
+/// v[..3].fill(Row([2.0; 8]));
+/// assert_eq!(gram(&v, &v, false)[5].0[7], 3.0 * 4.0);
+/// ```
 pub fn gram(v: &[Row], w: &[Row], parallel: bool) -> Tile {
     let arch = Arch::new();
     let per_slab = (v.len() / PADDING).div_ceil(SLABS).max(1) * PADDING;

@@ -18,6 +18,15 @@ pub struct SquareWeights {
 
 impl SquareWeights {
     /// The weights by row and column.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::squares::SquareWeights;
+    ///
+    /// let weights = SquareWeights::new(2, 1, |i, _| [10.0, 1.0][i]);
+    /// let mut out = [0.0];
+    /// weights.apply(&[2.0, 3.0], 2, &mut out);
+    /// assert_eq!(out, [10.0 * 4.0 + 9.0]);
+    /// ```
     pub fn new(n_in: usize, n_out: usize, weight: impl Fn(usize, usize) -> f64) -> Self {
         let group = |g: usize| {
             let mut tiles = vec![ZERO_TILE; n_in.div_ceil(WIDTH)];

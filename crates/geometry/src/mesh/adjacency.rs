@@ -125,7 +125,17 @@ pub struct FaceGeometry {
 }
 
 impl FaceGeometry {
-    /// Geometry of all faces of a mesh.
+    /// Geometry of all faces of a mesh; the normal follows the right-hand rule.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{FaceGeometry, TriMesh};
+    ///
+    /// let vertices = vec![[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]];
+    /// let geometry = FaceGeometry::new(&TriMesh { vertices, faces: vec![[0, 1, 2]] });
+    /// assert_eq!(geometry.areas, [4.5]);
+    /// assert_eq!(geometry.normals, [[0.0, 0.0, 1.0]]);
+    /// assert_eq!(geometry.centroids, [[1.0, 1.0, 0.0]]);
+    /// ```
     pub fn new(mesh: &TriMesh) -> Self {
         let mut result = Self::default();
         for f in 0..mesh.faces.len() {
@@ -173,6 +183,16 @@ const FLAT: f64 = 1e-9;
 
 impl DualGraph {
     /// Graph of a mesh's faces, with the bridges between its components. O(m log m).
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{DualGraph, icosphere};
+    ///
+    /// let dual = DualGraph::new(&icosphere(1), &[]);
+    /// assert_eq!((dual.n_faces(), dual.edges.len()), (80, 120));
+    /// assert_eq!(dual.neighbors(0).len(), 3);
+    /// // A sphere bends outward at every edge.
+    /// assert!(dual.edges.iter().all(|e| e.convex && e.angle > 0.0));
+    /// ```
     pub fn new(mesh: &TriMesh, bridges: &[Bridge]) -> Self {
         let geometry = FaceGeometry::new(mesh);
         let around = EdgeFaces::new(&mesh.faces);

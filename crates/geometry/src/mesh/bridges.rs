@@ -161,8 +161,22 @@ fn box_distance(node: &Node, p: [f64; 3]) -> f64 {
 }
 
 /// Virtual edges that connect all components (faces connected through shared edges); none for one
-/// component. Up to three for each pair the tree joins: the closest vertices, then others about as close
-/// but away from the first. About O(n log n).
+/// component. Up to three for each pair the tree joins: the closest vertices, then others about as
+/// close but away from the first. Lengths are in units of the mesh. About O(n log n).
+///
+/// ```
+/// use coseg_geometry::mesh::{TriMesh, bridges, icosphere};
+///
+/// let mut pair = icosphere(1);
+/// let n = pair.vertices.len() as u32;
+/// pair.vertices.extend(icosphere(1).vertices.iter().map(|[x, y, z]| [x + 3.0, *y, *z]));
+/// pair.faces.extend(icosphere(1).faces.iter().map(|face| face.map(|v| v + n)));
+/// // Two spheres of radius 1 whose centres are 3 apart leave a gap of 1.
+/// let found = bridges(&pair);
+/// assert!((1..=3).contains(&found.len()));
+/// assert!(found.iter().all(|b| b.length > 0.99 && b.vertices[0].min(b.vertices[1]) < n));
+/// assert!(bridges(&icosphere(1)).is_empty());
+/// ```
 pub fn bridges(mesh: &TriMesh) -> Vec<Bridge> {
     let edges = EdgeFaces::new(&mesh.faces);
     let (component, count) = components(mesh.faces.len(), &edges);

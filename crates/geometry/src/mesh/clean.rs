@@ -49,11 +49,26 @@ pub struct Cleaned {
     pub report: CleanReport,
 }
 
-/// Makes a parsed mesh measurable: O(n log n).
+/// Makes a parsed mesh measurable: welded, coherently oriented, centred, of area 1. O(n log n).
 ///
 /// Vertices at exactly equal positions become one. Degenerate triangles (two corners equal, or no
-/// height) and repeated ones (the same three corners in any order: the first stays) are dropped; each
-/// is mapped to the nearest face that stays. Neighbouring faces are made to agree about the outside.
+/// height) and repeated ones (the same three corners in any order: the first stays) are dropped;
+/// each is mapped to the nearest face that stays. Neighbouring faces are made to agree about the
+/// outside.
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, clean, parse};
+///
+/// // Vertex 4 lies where vertex 0 is, and the third face has no area.
+/// let off = "OFF\n5 3 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 0\n3 0 1 2\n3 4 2 3\n3 1 1 2\n";
+/// let cleaned = clean(&parse(off.as_bytes(), Format::Off)?)?;
+/// assert_eq!((cleaned.mesh.vertices.len(), cleaned.mesh.faces.len()), (4, 2));
+/// assert_eq!(cleaned.report.n_welded_vertices, 1);
+/// assert_eq!(cleaned.report.n_degenerate_triangles, 1);
+/// assert_eq!(cleaned.vertex_of_vertex[4], cleaned.vertex_of_vertex[0]);
+/// assert!((cleaned.area - 1.0).abs() < 1e-12); // of the input, in its units
+/// # Ok::<_, Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
 /// When no triangle has any area, or coordinates are too large or too close for their squares to be

@@ -44,9 +44,24 @@ impl Distances {
         self.heap.clear();
     }
 
-    /// Lowers `values` by paths from `source`, over edges that `neighbors` lists with their non-negative
-    /// costs; calls `reached` for each node that got nearer. Nodes that have a shorter distance already
-    /// keep it, and nothing is searched beyond them.
+    /// Lowers `values` by paths from `source`, over edges that `neighbors` lists with their
+    /// non-negative costs; calls `reached` for each node that got nearer. Nodes that have a shorter
+    /// distance already keep it, and nothing is searched beyond them.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::geodesic::Distances;
+    ///
+    /// // A path of five nodes, unit edges; distances to the nearer end.
+    /// let neighbors = |v: u32| {
+    ///     [v.wrapping_sub(1), v + 1].into_iter().filter(|w| *w < 5).map(|w| (w, 1.0))
+    /// };
+    /// let mut distances = Distances::default();
+    /// distances.reset(5);
+    /// for end in [0, 4] {
+    ///     distances.spread(end, neighbors, |_| {});
+    /// }
+    /// assert_eq!(distances.values, [0.0, 1.0, 2.0, 1.0, 0.0]);
+    /// ```
     pub fn spread<I: Iterator<Item = (u32, f64)>>(
         &mut self,
         source: u32,
@@ -76,7 +91,16 @@ impl Distances {
 }
 
 impl EdgeGraph {
-    /// Graph of a mesh's edges and of bridges.
+    /// Graph of a mesh's edges and of bridges; lengths are in units of the mesh. O(m log m).
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{EdgeGraph, icosphere};
+    ///
+    /// let graph = EdgeGraph::new(&icosphere(2), &[]);
+    /// assert_eq!(graph.n_vertices(), 162);
+    /// // A corner of the icosahedron keeps its five neighbours; all other vertices have six.
+    /// assert_eq!((graph.neighbors(0).len(), graph.neighbors(100).len()), (5, 6));
+    /// ```
     pub fn new(mesh: &TriMesh, bridges: &[Bridge]) -> Self {
         let p = &mesh.vertices;
         let mut edges: Vec<([u32; 2], f64)> = EdgeFaces::new(&mesh.faces)
@@ -126,7 +150,19 @@ impl EdgeGraph {
         &self.neighbors[self.offsets[v] as usize..self.offsets[v + 1] as usize]
     }
 
-    /// Distances `(n,)` from a vertex; infinite where there is no path. O(n log n).
+    /// Distances `(n,)` from a vertex along edges; infinite where there is no path. O(n log n).
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{EdgeGraph, icosphere};
+    ///
+    /// let distances = EdgeGraph::new(&icosphere(3), &[]).dijkstra(0);
+    /// assert_eq!(distances[0], 0.0);
+    /// // Vertex 3 is opposite: half a great circle away.
+    /// assert!((distances[3] / std::f64::consts::PI - 1.0).abs() < 0.2);
+    /// ```
+    ///
+    /// # Panics
+    /// If the vertex does not exist.
     pub fn dijkstra(&self, source: u32) -> Vec<f64> {
         let mut distances = Distances::default();
         self.dijkstra_into(source, &mut distances);
@@ -135,9 +171,23 @@ impl EdgeGraph {
 
     /// As [`Self::dijkstra`], into memory that is used again.
     ///
-    /// By buckets in the place of a heap (Meyer and Sanders 2003, *Δ-stepping*): the few vertices that
-    /// are visited twice cost less than keeping an order. The distances are the same bits, because sums
-    /// along a path do not depend on when they are made.
+    /// By buckets in the place of a heap (Meyer and Sanders 2003, *Δ-stepping*): the few vertices
+    /// that are visited twice cost less than keeping an order. The distances are the same bits,
+    /// because sums along a path do not depend on when they are made.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{EdgeGraph, geodesic::Distances, icosphere};
+    ///
+    /// let graph = EdgeGraph::new(&icosphere(2), &[]);
+    /// let mut distances = Distances::default();
+    /// for source in [0, 50] {
+    ///     graph.dijkstra_into(source, &mut distances);
+    ///     assert_eq!(distances.values, graph.dijkstra(source));
+    /// }
+    /// ```
+    ///
+    /// # Panics
+    /// If the vertex does not exist.
     pub fn dijkstra_into(&self, source: u32, distances: &mut Distances) {
         distances.reset(self.n_vertices());
         let Distances {

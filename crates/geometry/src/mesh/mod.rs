@@ -45,7 +45,16 @@ pub struct TriMesh {
 }
 
 impl TriMesh {
-    /// Corners of a face.
+    /// Coordinates of the three corners of a face, in the order of the face.
+    ///
+    /// ```
+    /// let sphere = coseg_geometry::mesh::icosphere(0);
+    /// let [a, _, _] = sphere.corners(7);
+    /// assert_eq!(a, sphere.vertices[sphere.faces[7][0] as usize]);
+    /// ```
+    ///
+    /// # Panics
+    /// If the face or one of its vertices does not exist.
     #[inline]
     pub fn corners(&self, face: usize) -> [[f64; 3]; 3] {
         self.faces[face].map(|v| self.vertices[v as usize])
@@ -74,8 +83,15 @@ impl Format {
     /// Extensions of file names, as messages list them.
     pub const EXTENSIONS: &str = ".obj, .off, .ply, .stl, .glb, .gltf";
 
-    /// The format a file name's extension says, in any case; `None` for any other extension. Whether it is
-    /// text or binary the bytes say.
+    /// The format that the extension of a file name stands for, in upper or lower case; `None` for
+    /// any other extension. Text and binary forms share a format: [`parse`] tells them apart.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::Format;
+    ///
+    /// assert_eq!(Format::from_name("shapes/Chair.GLB"), Some(Format::Gltf));
+    /// assert_eq!(Format::from_name("chair.step"), None);
+    /// ```
     pub fn from_name(file_name: &str) -> Option<Self> {
         let (stem, extension) = file_name.rsplit_once('.')?;
         if stem.is_empty() {
@@ -126,6 +142,14 @@ pub struct ParsedMesh {
 
 impl ParsedMesh {
     /// The corners of each polygon, in file order.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{Format, parse};
+    ///
+    /// let square = parse(b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n", Format::Obj)?;
+    /// assert_eq!(square.polygons(), [[0, 1, 2, 3]]);
+    /// # Ok::<_, coseg_geometry::mesh::ParseError>(())
+    /// ```
     pub fn polygons(&self) -> Vec<Vec<u32>> {
         let mut polygons: Vec<Vec<u32>> = vec![Vec::new(); self.n_polygons];
         for (triangle, &polygon) in self.triangles.iter().zip(&self.polygon_of_triangle) {

@@ -35,9 +35,22 @@ pub struct Proxy {
 
 /// A mesh of about `working_faces` faces for a cleaned one, which must have a face.
 ///
-/// Each cleaned face maps to the proxy face nearest to its centroid, a face that looks the other way
-/// counting as farther, so that the two sides of a thin wall are not confused. Components may vanish
-/// when there are too many; their faces map to the nearest ones that stay. O(m log m).
+/// Each cleaned face maps to the proxy face nearest to its centroid, a face that looks the other
+/// way counting as farther, so that the two sides of a thin wall are not confused. Components may
+/// vanish when there are too many; their faces map to the nearest ones that stay. O(m log m).
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, clean, icosphere, parse, proxy, write};
+///
+/// let sphere = write::off(&icosphere(4));
+/// let cleaned = clean(&parse(sphere.as_bytes(), Format::Off)?)?;
+/// let proxy = proxy(&cleaned.mesh, 1_000);
+/// assert_eq!(cleaned.mesh.faces.len(), 5_120);
+/// assert!((900..=1_150).contains(&proxy.mesh.faces.len()));
+/// // The way back: the proxy face of each of the 5,120.
+/// assert_eq!(proxy.face_map.len(), 5_120);
+/// # Ok::<_, Box<dyn std::error::Error>>(())
+/// ```
 pub fn proxy(cleaned: &TriMesh, working_faces: u32) -> Proxy {
     let working = working_faces.max(4) as usize;
     let n = cleaned.faces.len();

@@ -5,8 +5,16 @@ use super::CleanReport;
 macro_rules! counts {
     (first: $($name:ident),+; later: $($later:ident),+ $(,)?) => {
         impl CleanReport {
-            /// Every count with its name. Taken apart without `..`, so that a new one cannot be forgotten.
+            /// Every count with its name.
+            ///
+            /// ```
+            /// use coseg_geometry::mesh::CleanReport;
+            ///
+            /// let report = CleanReport { n_polygons: 12, ..CleanReport::default() };
+            /// assert_eq!(report.counts()[0], ("n_polygons", 12));
+            /// ```
             pub fn counts(&self) -> Vec<(&'static str, usize)> {
+                // Without `..`, so that a new count cannot be forgotten.
                 let Self { $($name,)+ $($later),+ } = *self;
                 vec![$((stringify!($name), $name),)+ $((stringify!($later), $later)),+]
             }

@@ -59,8 +59,24 @@ enum Turn {
     Same,
 }
 
-/// The mesh without the walls that have another close by, and the map from triangles and polygons to it.
-/// A mesh without such walls stays as it is. O(m log m) for one with them, else O(m).
+/// The mesh without the walls that have another close by, and the map from triangles and polygons
+/// to it. A mesh without such walls stays as it is. O(m log m) for one with them, else O(m).
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, TriMesh, clean, icosphere, outer_shells, parse, write};
+///
+/// // A ball with a second wall a hundredth of its radius inside the first, turned inward.
+/// let TriMesh { mut vertices, mut faces } = icosphere(3);
+/// let n = vertices.len() as u32;
+/// vertices.extend(icosphere(3).vertices.iter().map(|p| p.map(|x| 0.99 * x)));
+/// faces.extend(icosphere(3).faces.iter().map(|&[a, b, c]| [a + n, c + n, b + n]));
+/// let file = write::off(&TriMesh { vertices, faces });
+/// let found = outer_shells(clean(&parse(file.as_bytes(), Format::Off)?)?);
+/// assert_eq!((found.report.n_inner_walls, found.mesh.faces.len()), (1, 1_280));
+/// // The inner triangles have faces of the outer wall.
+/// assert!(found.face_of_triangle.iter().all(|f| (*f as usize) < found.mesh.faces.len()));
+/// # Ok::<_, Box<dyn std::error::Error>>(())
+/// ```
 pub fn outer_shells(cleaned: Cleaned) -> Cleaned {
     if cleaned.report.n_components < 2 {
         return cleaned;

@@ -114,11 +114,30 @@ pub enum LaplacianError {
 /// eigenvalues move by about `w (φ(p) - φ(q))²`, a tenth of a percent.
 const BRIDGE_WEIGHT: f64 = 0.01;
 
-/// The Laplacian of a mesh. Costs O(n) (`mesh-laplace`: about 50 neighbours a vertex).
+/// The Laplacian of a mesh: stiffness W `(n, n)` and lumped mass `(n,)`. O(n) (`mesh-laplace`:
+/// about 50 neighbours a vertex).
 ///
-/// Boundaries are natural (Neumann). Each of `bridges` becomes an edge of a hundredth of the mean
-/// edge weight, so that components are joined in W but keep their own spectra to about 0.1 %. Every
-/// vertex needs a face; faces of zero area are refused by `Cotan` and accepted by the others.
+/// W is positive semidefinite, so the operator `A⁻¹ W` is minus the Laplace–Beltrami operator. W
+/// does not depend on the scale of the mesh; the mass has the unit of its area. Boundaries are
+/// natural (Neumann). Each of `bridges` becomes an edge of a hundredth of the mean edge weight, so
+/// that components are joined in W but keep their own spectra to about 0.1 %.
+///
+/// ```
+/// use coseg_geometry::mesh::icosphere;
+/// use coseg_geometry::operators::{Operator, laplacian};
+///
+/// let sphere = laplacian(&icosphere(3), &[], Operator::Tufted)?;
+/// for row in sphere.stiffness.outer_iterator() {
+///     assert!(row.iter().map(|(_, w)| w).sum::<f64>().abs() < 1e-9); // constants are harmonic
+/// }
+/// let area: f64 = sphere.mass.iter().sum();
+/// assert!((area / (4.0 * std::f64::consts::PI) - 1.0).abs() < 0.01);
+/// # Ok::<_, coseg_geometry::operators::LaplacianError>(())
+/// ```
+///
+/// # Errors
+/// Every vertex needs a face and finite coordinates. Faces of zero area are refused by
+/// [`Operator::Cotan`] and accepted by the others.
 pub fn laplacian(
     mesh: &TriMesh,
     bridges: &[Bridge],

@@ -35,12 +35,26 @@ impl PartialEq for Merge {
 }
 impl Eq for Merge {}
 
-/// Merges adjacent patches greedily until `n` regions are left, for each `n` in `sizes`, and returns
-/// the region of each patch for each of them, regions numbered in the order of their first patch.
+/// Merges adjacent patches greedily until `n` regions are left, for each `n` in `sizes`, and
+/// returns the region of each patch for each of them, regions numbered in the order of their first
+/// patch.
 ///
-/// The cost of a merge is Ward's (descriptor difference of `means (n_patches, dim)` weighted by area),
-/// times `exp(crease / 0.05)`, over the length of the common boundary relative to the smaller side.
-/// Where patches do not touch, more regions than asked for are left.
+/// The cost of a merge is Ward's (descriptor difference of `means (n_patches, dim)` weighted by
+/// area), times `exp(crease / 0.05)`, over the length of the common boundary relative to the
+/// smaller side. Where patches do not touch, more regions than asked for are left.
+///
+/// ```
+/// use coseg_geometry::segmentation::{PatchGraph, merge_patches};
+///
+/// // Four flat patches in a row, with one descriptor each.
+/// let chain = PatchGraph {
+///     patch_of_face: vec![0, 1, 2, 3],
+///     area: vec![0.25; 4],
+///     edges: (0..3).map(|i| ([i, i + 1], 1.0, 0.0)).collect(),
+/// };
+/// let found = merge_patches(&chain, &[0.0, 0.2, 5.0, 5.1], 1, &[3, 2]);
+/// assert_eq!(found, [[0, 1, 2, 2], [0, 0, 1, 1]]);
+/// ```
 pub fn merge_patches(
     graph: &PatchGraph,
     means: &[f64],
@@ -142,8 +156,23 @@ pub fn merge_patches(
         .collect()
 }
 
-/// Part of each face `(m,)`, numbered from 0 without gaps, when its `patches (m,)` are merged until `n` parts are left
-/// (or more, see [`merge_patches`]), by standardised descriptors `(m, dim)`.
+/// Part of each face `(m,)`, numbered from 0 without gaps, when its `patches (m,)` are merged until
+/// `n` parts are left (or more, see [`merge_patches`]), by standardised descriptors `(m, dim)`.
+///
+/// ```
+/// use coseg_geometry::mesh::{DualGraph, FaceGeometry, icosphere};
+/// use coseg_geometry::segmentation::{Surface, parts, patches};
+///
+/// let sphere = icosphere(3);
+/// let patches = patches(&sphere, &DualGraph::new(&sphere, &[]), 0, 40);
+/// // One descriptor, which tells north from south.
+/// let centroids = FaceGeometry::new(&sphere).centroids;
+/// let descriptors: Vec<f32> = centroids.iter().map(|c| c[2].signum() as f32).collect();
+/// let found = parts(&Surface::new(&sphere), &patches, &descriptors, 1, 2);
+/// assert_eq!(found.iter().max(), Some(&1));
+/// let pole = |z: f64| centroids.iter().position(|c| c[2] * z > 0.95).unwrap();
+/// assert_ne!(found[pole(1.0)], found[pole(-1.0)]);
+/// ```
 pub fn parts(
     surface: &Surface,
     patches: &[u32],
@@ -189,7 +218,22 @@ impl PartGraph {
     /// Values a part in `shape`.
     pub const N_SHAPE: usize = 11;
 
-    /// Describes the parts of a shape, given the part of each patch and face descriptors `(m, dim)`.
+    /// Describes the parts of a shape, given the part of each patch and face descriptors `(m,
+    /// dim)`.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{DualGraph, icosphere};
+    /// use coseg_geometry::segmentation::{PartGraph, PatchGraph, Surface, patches};
+    ///
+    /// let sphere = icosphere(2);
+    /// let surface = Surface::new(&sphere);
+    /// let patches = patches(&sphere, &DualGraph::new(&sphere, &[]), 0, 4);
+    /// let graph = PatchGraph::new(&surface, &patches);
+    /// let found = PartGraph::new(&surface, &graph, &[0, 0, 1, 1], &vec![1.0; 320], 1);
+    /// assert_eq!(found.len(), 2);
+    /// assert!((found.area.iter().sum::<f64>() - 1.0).abs() < 1e-9);
+    /// assert!(found.boundary[1] > 0.0); // the two parts touch
+    /// ```
     pub fn new(
         surface: &Surface,
         patches: &PatchGraph,

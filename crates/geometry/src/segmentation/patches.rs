@@ -28,12 +28,22 @@ fn cost(edge: &DualEdge) -> f64 {
 }
 
 /// Patch of each face `(m,)` of a mesh of area 1, numbered without gaps by first face: at most
-/// `n_patches` (at least 1), fewer when there are fewer faces.
+/// `n_patches` (at least 1), fewer when there are fewer faces; empty without faces.
 ///
 /// The first seed is the face farthest from `start`, which is best an extremity
-/// ([`FaceDescriptors::farthest_start`](crate::descriptors::FaceDescriptors::farthest_start)). Bridges
-/// are crossed last, and components no bridge reaches get patches of their own, beyond `n_patches` if
-/// need be. O(m log m), a little more than one search.
+/// ([`FaceDescriptors::farthest_start`](crate::descriptors::FaceDescriptors::farthest_start)).
+/// Bridges are crossed last, and components no bridge reaches get patches of their own, beyond
+/// `n_patches` if need be. O(m log m), a little more than one search.
+///
+/// ```
+/// use coseg_geometry::mesh::{DualGraph, icosphere};
+/// use coseg_geometry::segmentation::patches;
+///
+/// let sphere = icosphere(3);
+/// let found = patches(&sphere, &DualGraph::new(&sphere, &[]), 0, 20);
+/// assert_eq!((found.len(), found[0]), (sphere.faces.len(), 0));
+/// assert_eq!(found.iter().max(), Some(&19));
+/// ```
 pub fn patches(mesh: &TriMesh, dual: &DualGraph, start: u32, n_patches: usize) -> Vec<u32> {
     let m = mesh.faces.len();
     if m == 0 {

@@ -34,13 +34,33 @@ pub struct Surface {
 }
 
 impl Surface {
-    /// The surface of a proxy mesh.
+    /// The surface of a proxy mesh, whose components are joined by bridges.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::segmentation::Surface;
+    ///
+    /// let surface = Surface::new(&icosphere(2));
+    /// assert_eq!((surface.n_faces(), surface.edges.len()), (320, 480));
+    /// assert!((surface.area.iter().sum::<f64>() - 1.0).abs() < 1e-9);
+    /// // A sphere has no concave crease, at which a boundary would cost less.
+    /// assert!(surface.edges.iter().all(|e| e.crease < 0.1));
+    /// ```
     pub fn new(mesh: &TriMesh) -> Self {
         let joins = bridges(mesh);
         Self::from_dual(&FaceGeometry::new(mesh), &DualGraph::new(mesh, &joins))
     }
 
     /// The surface, where geometry and dual graph are there already.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{DualGraph, FaceGeometry, icosphere};
+    /// use coseg_geometry::segmentation::Surface;
+    ///
+    /// let sphere = icosphere(1);
+    /// let (geometry, dual) = (FaceGeometry::new(&sphere), DualGraph::new(&sphere, &[]));
+    /// assert_eq!(Surface::from_dual(&geometry, &dual), Surface::new(&sphere));
+    /// ```
     pub fn from_dual(geometry: &FaceGeometry, dual: &DualGraph) -> Self {
         let total: f64 = geometry.areas.iter().sum();
         let real = dual.edges.iter().filter(|e| !e.bridge);
@@ -82,7 +102,19 @@ impl Surface {
         self.area.len()
     }
 
-    /// Area-weighted mean of the rows of `values (m, dim)` over each patch; `(n_patches, dim)`.
+    /// Area-weighted mean of the rows of `values (m, dim)` over each patch; `(n_patches, dim)`. A
+    /// patch without faces gets zeros.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::segmentation::Surface;
+    ///
+    /// let surface = Surface::new(&icosphere(0));
+    /// let halves: Vec<u32> = (0..20).map(|f| f / 10).collect();
+    /// let values: Vec<f32> = (0..20).map(|f| f as f32).collect();
+    /// let means = surface.patch_means(&halves, 2, &values, 1);
+    /// assert!((means[0] - 4.5).abs() < 1e-9 && (means[1] - 14.5).abs() < 1e-9);
+    /// ```
     pub fn patch_means<T: Copy + Into<f64>>(
         &self,
         patches: &[u32],
@@ -122,6 +154,20 @@ pub struct PatchGraph {
 
 impl PatchGraph {
     /// The graph of `patches (m,)`, numbered from 0 without gaps.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{FaceGeometry, icosphere};
+    /// use coseg_geometry::segmentation::{PatchGraph, Surface};
+    ///
+    /// let sphere = icosphere(3);
+    /// let centroids = FaceGeometry::new(&sphere).centroids;
+    /// let south: Vec<u32> = centroids.iter().map(|c| u32::from(c[2] < 0.0)).collect();
+    /// let graph = PatchGraph::new(&Surface::new(&sphere), &south);
+    /// assert_eq!((graph.len(), graph.edges.len()), (2, 1));
+    /// let ([a, b], length, _) = graph.edges[0];
+    /// assert_eq!([a, b], [0, 1]);
+    /// assert!(length >= 6.0); // the equator, along edges
+    /// ```
     pub fn new(surface: &Surface, patches: &[u32]) -> Self {
         let n = patches.iter().max().map_or(0, |p| *p as usize + 1);
         let mut area = vec![0.0; n];

@@ -59,7 +59,26 @@ struct Panel {
 }
 
 impl Eigenpairs {
-    /// As [`Spectrum::smallest`].
+    /// As [`Spectrum::smallest`], with the eigenvectors where the solver left them.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Eigenpairs, Options};
+    ///
+    /// let sphere = laplacian(&icosphere(3), &[], Operator::Tufted)?;
+    /// let pairs = Eigenpairs::smallest(&sphere.stiffness, &sphere.mass, 4, &Options::default())?;
+    /// assert_eq!((pairs.n(), pairs.k()), (642, 4));
+    /// // The first eigenvector is constant, 1 / √area.
+    /// let mut rows = [0.0; 8];
+    /// pairs.rows(10, &mut rows); // vertices 10 and 11
+    /// let area: f64 = sphere.mass.iter().sum();
+    /// assert!((rows[0] - area.powf(-0.5)).abs() < 1e-9 && (rows[4] - rows[0]).abs() < 1e-9);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
+    ///
+    /// # Errors
+    /// See [`SpectrumError`].
     pub fn smallest(
         stiffness: &sprs::CsMat<f64>,
         mass: &[f64],
@@ -80,11 +99,25 @@ impl Eigenpairs {
         self.eigenvalues.len()
     }
 
-    /// Writes rows of Φ to `out`, row-major, from vertex `first` on: as many as `out` has multiples of k.
-    /// `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the first such) is positive.
+    /// Writes rows of Φ to `out`, row-major, from vertex `first` on: as many as `out` has multiples
+    /// of k. `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the first such) is
+    /// positive.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Eigenpairs, Options};
+    ///
+    /// let sphere = laplacian(&icosphere(2), &[], Operator::Tufted)?;
+    /// let pairs = Eigenpairs::smallest(&sphere.stiffness, &sphere.mass, 4, &Options::default())?;
+    /// let mut two = [0.0; 2 * 4];
+    /// pairs.rows(20, &mut two);
+    /// assert_eq!(two, pairs.all_rows()[20 * 4..22 * 4]);
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     ///
     /// # Panics
-    /// Rows beyond the last.
+    /// If `out` has room for rows beyond the last.
     pub fn rows(&self, first: usize, out: &mut [f64]) {
         let rows = out.chunks_exact_mut(self.k());
         for (&(part, at), row) in self.places[first..first + rows.len()].iter().zip(rows) {
@@ -111,6 +144,20 @@ impl Eigenpairs {
     }
 
     /// All rows of Φ `(n, k)`, row-major.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Eigenpairs, Options};
+    ///
+    /// let sphere = laplacian(&icosphere(3), &[], Operator::Tufted)?;
+    /// let pairs = Eigenpairs::smallest(&sphere.stiffness, &sphere.mass, 4, &Options::default())?;
+    /// let rows = pairs.all_rows();
+    /// let weighted = rows.chunks_exact(4).zip(&sphere.mass);
+    /// let norm: f64 = weighted.map(|(row, m)| m * row[2] * row[2]).sum();
+    /// assert!((norm - 1.0).abs() < 1e-9); // mass-orthonormal
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     pub fn all_rows(&self) -> Vec<f64> {
         let width = ROWS * self.k();
         let mut out = vec![0.0; self.n() * self.k()];
@@ -123,7 +170,18 @@ impl Eigenpairs {
         out
     }
 
-    /// Φ as one matrix: the solver's memory is given back.
+    /// Φ as one matrix; the solver's memory is freed.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::icosphere;
+    /// use coseg_geometry::operators::{Operator, laplacian};
+    /// use coseg_geometry::spectrum::{Eigenpairs, Options};
+    ///
+    /// let sphere = laplacian(&icosphere(2), &[], Operator::Tufted)?;
+    /// let pairs = Eigenpairs::smallest(&sphere.stiffness, &sphere.mass, 4, &Options::default())?;
+    /// assert_eq!(pairs.into_spectrum().eigenvectors.shape(), (162, 4));
+    /// # Ok::<_, Box<dyn std::error::Error>>(())
+    /// ```
     pub fn into_spectrum(self) -> Spectrum {
         let (n, k) = (self.n(), self.k());
         let mut flat = vec![0.0; n * k];

@@ -36,6 +36,29 @@ pub struct Factor {
 
 impl Factor {
     /// Factorises `matrix - shift I`, where `matrix` is already in the order of `analysis`.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::ldlt::{Analysis, Factor, SymmetricSparse};
+    /// use coseg_geometry::linalg::panel::{Row, zero_panel};
+    ///
+    /// let matrix = SymmetricSparse {
+    ///     row_starts: vec![0, 2, 4],
+    ///     columns: vec![0, 1, 0, 1],
+    ///     values: vec![2.0, -1.0, -1.0, 2.0], // with eigenvalues 1 and 3
+    /// };
+    /// let analysis = Analysis::new(&matrix)?;
+    /// let factor = Factor::new(&analysis, &matrix.permuted(&analysis.order), 2.5)?;
+    /// assert_eq!(factor.n_negative, 1); // one eigenvalue is below 2.5
+    /// let mut panel = zero_panel(2);
+    /// panel[..2].fill(Row([1.0; 8])); // (1, 1), the eigenvector of 1, eight times
+    /// factor.solve(&mut panel, false);
+    /// assert!((panel[0].0[0] * (1.0 - 2.5) - 1.0).abs() < 1e-12);
+    /// # Ok::<_, coseg_geometry::linalg::ldlt::LdltError>(())
+    /// ```
+    ///
+    /// # Errors
+    /// A pivot that is zero: the shift is an eigenvalue of a leading block; another one nearby is
+    /// not.
     pub fn new(
         analysis: &Analysis,
         matrix: &SymmetricSparse,

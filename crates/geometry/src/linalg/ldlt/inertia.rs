@@ -40,6 +40,26 @@ pub struct Inertia {
 impl Inertia {
     /// Counts the eigenvalues of `matrix`, already in the order of `analysis`, below `shift`. The
     /// bound is made sharper, at the cost of a few solves, until it is below `enough`.
+    ///
+    /// ```
+    /// use coseg_geometry::linalg::ldlt::{Analysis, Inertia, SymmetricSparse};
+    ///
+    /// let matrix = SymmetricSparse {
+    ///     row_starts: vec![0, 2, 4],
+    ///     columns: vec![0, 1, 0, 1],
+    ///     values: vec![2.0, -1.0, -1.0, 2.0], // with eigenvalues 1 and 3
+    /// };
+    /// let analysis = Analysis::new(&matrix)?;
+    /// let found = Inertia::new(&analysis, &matrix.permuted(&analysis.order), 2.5, 0.5)?;
+    /// assert_eq!(found.n_negative, 1);
+    /// // Rounding cannot have moved an eigenvalue across the shift, half a unit away.
+    /// assert!(found.perturbation < 0.5);
+    /// # Ok::<_, coseg_geometry::linalg::ldlt::LdltError>(())
+    /// ```
+    ///
+    /// # Errors
+    /// A pivot that is zero: the shift is an eigenvalue of a leading block; another one nearby is
+    /// not.
     pub fn new(
         analysis: &Analysis,
         matrix: &SymmetricSparse,

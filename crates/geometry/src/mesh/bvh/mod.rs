@@ -238,7 +238,16 @@ impl Builder {
 }
 
 impl Bvh {
-    /// The tree of a mesh's faces: O(m log m). A mesh without faces answers every query with `None`.
+    /// The tree of a mesh's faces: O(m log m). A mesh without faces answers every query with
+    /// `None`.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{Bvh, Search, icosphere};
+    ///
+    /// let tree = Bvh::new(&icosphere(3));
+    /// let nearest = tree.nearest(&mut Search::default(), [0.0, 0.0, 3.0], 10.0, |_| 0.0);
+    /// assert!(nearest.is_some_and(|(_, distance)| (distance - 2.0).abs() < 0.01));
+    /// ```
     pub fn new(mesh: &TriMesh) -> Self {
         let bounds: Vec<Bounds> = (0..mesh.faces.len())
             .map(|f| {

@@ -7,14 +7,40 @@ use crate::mesh::{dot, sub};
 use pulp::NullaryFnOnce;
 
 impl Bvh {
-    /// Distance from a point to a face.
+    /// Euclidean distance from a point to a face.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{Bvh, TriMesh};
+    ///
+    /// let vertices = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    /// let tree = Bvh::new(&TriMesh { vertices, faces: vec![[0, 1, 2]] });
+    /// assert_eq!(tree.distance_to(0, [0.0, 0.0, 2.0]), 2.0);
+    /// ```
+    ///
+    /// # Panics
+    /// If the face does not exist.
     pub fn distance_to(&self, face: u32, point: [f64; 3]) -> f64 {
         triangle_distance(&self.triangle(face), point)
     }
 
-    /// The face with the least `distance to point + extra(face)`, and that sum; `None` when no sum is
-    /// below `limit`. `extra` is never negative. Of equal faces the first met, which is the same in
-    /// every run.
+    /// The face with the least `distance to point + extra(face)`, and that sum; `None` when no sum
+    /// is below `limit`. `extra` is never negative. Of equal faces the first met, which is the same
+    /// in every run.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{Bvh, FaceGeometry, Search, icosphere};
+    ///
+    /// let sphere = icosphere(2);
+    /// let (tree, mut search) = (Bvh::new(&sphere), Search::default());
+    /// let above = FaceGeometry::new(&sphere).centroids[40].map(|x| 1.5 * x);
+    /// let found = tree.nearest(&mut search, above, f64::INFINITY, |_| 0.0);
+    /// assert_eq!(found.map(|(face, _)| face), Some(40));
+    /// // With a penalty on that face another one is nearest; within 0.1 there is none.
+    /// let penalty = |face| if face == 40 { 1.0 } else { 0.0 };
+    /// let other = tree.nearest(&mut search, above, f64::INFINITY, penalty);
+    /// assert_ne!(other.map(|(face, _)| face), Some(40));
+    /// assert_eq!(tree.nearest(&mut search, above, 0.1, |_| 0.0), None);
+    /// ```
     pub fn nearest(
         &self,
         search: &mut Search,

@@ -12,9 +12,21 @@ use pulp::NullaryFnOnce;
 
 impl Bvh {
     /// For each of several rays from `origin` the distance along its direction to the first face it
-    /// meets, from either side, other than face `except`; infinite when it meets none. Directions have
-    /// length 1, or less: then distances are in units of it. Rays are quickest in the order of their
-    /// directions.
+    /// meets, from either side, other than face `except`; infinite when it meets none. Directions
+    /// have length 1, or less: then distances are in units of it. Rays are quickest in the order of
+    /// their directions.
+    ///
+    /// ```
+    /// use coseg_geometry::mesh::{Bvh, Search, icosphere};
+    ///
+    /// let tree = Bvh::new(&icosphere(3));
+    /// let mut lengths = Vec::new();
+    /// // From outside: towards the sphere, and away from it. No face is left out.
+    /// let rays = [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]];
+    /// tree.cast(&mut Search::default(), [0.01, 0.02, 3.0], &rays, u32::MAX, &mut lengths);
+    /// assert!((lengths[0] - 2.0).abs() < 0.01);
+    /// assert_eq!(lengths[1], f64::INFINITY);
+    /// ```
     pub fn cast(
         &self,
         search: &mut Search,

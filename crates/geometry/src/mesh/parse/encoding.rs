@@ -16,7 +16,15 @@ enum Order {
     Big,
 }
 
-/// The text in UTF-8, or the bytes as they are if they are in no other Unicode encoding.
+/// The text in UTF-8 without a byte-order mark, or the bytes as they are if they are in no other
+/// Unicode encoding.
+///
+/// ```
+/// use coseg_geometry::mesh::as_utf8;
+///
+/// assert_eq!(*as_utf8(b"\xff\xfeO\0F\0F\0"), *b"OFF");
+/// assert_eq!(*as_utf8(b"OFF"), *b"OFF");
+/// ```
 pub fn as_utf8(bytes: &[u8]) -> Cow<'_, [u8]> {
     if let Some(rest) = bytes.strip_prefix(b"\xef\xbb\xbf") {
         return Cow::Borrowed(rest);

@@ -124,7 +124,23 @@ pub enum ParseError {
     Reader { reason: String },
 }
 
-/// What the bytes of a file in `format` hold.
+/// Reads the polygons of a mesh file and triangulates them; vertices and polygons keep their order.
+///
+/// Coordinates are those of the file, in its units. Degenerate faces and unused vertices are kept,
+/// for [`clean`](super::clean) to deal with; what is read with reservations, or not at all, is
+/// counted in [`ParsedMesh::findings`]. The cost is linear in the size of the file.
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, ParseError, parse};
+///
+/// let square = parse(b"OFF\n4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n", Format::Off)?;
+/// assert_eq!((square.vertices.len(), square.n_polygons), (4, 1));
+/// assert_eq!(square.triangles, [[0, 1, 2], [0, 2, 3]]);
+/// assert_eq!(square.polygon_of_triangle, [0, 0]);
+///
+/// assert_eq!(parse(b"", Format::Off), Err(ParseError::Empty));
+/// # Ok::<_, ParseError>(())
+/// ```
 ///
 /// # Errors
 /// Anything that is not a mesh with at least one face, indices in range and finite corners.

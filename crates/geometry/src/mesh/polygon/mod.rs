@@ -54,6 +54,17 @@ impl Triangulator {
     ///
     /// O(n log n) for ordinary polygons.
     ///
+    /// ```
+    /// use coseg_geometry::mesh::Triangulator;
+    ///
+    /// // A dart: the fan from its first corner would leave it.
+    /// let dart = [[2.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
+    /// let mut triangles = Vec::new();
+    /// let kind = Triangulator::default().triangulate(&dart, &[0, 1, 2, 3], |t| triangles.push(t));
+    /// assert_eq!(triangles.len(), 2);
+    /// assert!(kind.simple && kind.planar && !kind.fan);
+    /// ```
+    ///
     /// # Panics
     /// If there are no corners.
     pub fn triangulate(

@@ -89,11 +89,21 @@ fn upright(up: [f64; 3]) -> [f64; 4] {
     }
 }
 
-/// A binary glTF file of one mesh, called `name`. `material` gives the name and sRGB colour of a label. Where
-/// the coordinate axis `up` is not +Y a node around the mesh turns it there.
+/// A binary glTF file of one mesh, called `name`. `material` gives the name and sRGB colour of a
+/// label. Where the coordinate axis `up` is not +Y a node around the mesh turns it there.
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, icosphere, parse, write};
+///
+/// let sphere = icosphere(1);
+/// let labels = vec![0; sphere.faces.len()];
+/// let material = |label| (format!("part-{label}"), [200, 80, 40]);
+/// let file = write::glb("ball", &sphere.vertices, &sphere.faces, &labels, None, material);
+/// assert_eq!(parse(&file, Format::Gltf)?.n_polygons, sphere.faces.len());
+/// # Ok::<_, coseg_geometry::mesh::ParseError>(())
+/// ```
 ///
 /// # Panics
-///
 /// If there is not one label per polygon, or a polygon has no corners.
 pub fn glb<P: AsRef<[u32]>>(
     name: &str,
@@ -207,7 +217,15 @@ pub fn glb<P: AsRef<[u32]>>(
     glb_of(json, binary)
 }
 
-/// JSON and binary chunk in one file, each padded to four bytes.
+/// The file of a JSON and a binary chunk, each padded to four bytes.
+///
+/// ```
+/// let json = "{\"asset\":{\"version\":\"2.0\"}}".to_string();
+/// let file = coseg_geometry::mesh::write::glb_of(json, vec![1, 2, 3]);
+/// assert!(file.starts_with(b"glTF"));
+/// // The header says how long the file is.
+/// assert_eq!(file[8..12], (file.len() as u32).to_le_bytes());
+/// ```
 pub fn glb_of(mut json: String, mut binary: Vec<u8>) -> Vec<u8> {
     binary.resize(binary.len().next_multiple_of(4), 0);
     while !json.len().is_multiple_of(4) {

@@ -13,7 +13,16 @@ use super::TriMesh;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// Object File Format text.
+/// Object File Format text. Reading it gives back the same numbers.
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, icosphere, parse, write};
+///
+/// let sphere = icosphere(1);
+/// let read = parse(write::off(&sphere).as_bytes(), Format::Off)?;
+/// assert_eq!((read.vertices, read.triangles), (sphere.vertices, sphere.faces));
+/// # Ok::<_, coseg_geometry::mesh::ParseError>(())
+/// ```
 pub fn off(mesh: &TriMesh) -> String {
     let mut out = String::with_capacity(60 * mesh.vertices.len() + 20 * mesh.faces.len());
     out.push_str("OFF\n");
@@ -30,11 +39,19 @@ pub fn off(mesh: &TriMesh) -> String {
     out
 }
 
-/// Wavefront OBJ text: a group and a material, named by `name`, for every run of polygons of one label.
-/// `material_file` is the name of a file with the text of [`mtl`].
+/// Wavefront OBJ text: a group and a material, named by `name`, for every run of polygons of one
+/// label. `material_file` is the name of a file with the text of [`mtl`].
+///
+/// ```
+/// use coseg_geometry::mesh::write;
+///
+/// let vertices = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+/// let text = write::obj(&vertices, &[[0, 1, 2]], &[7], |l| format!("part-{l}"), "parts.mtl");
+/// assert!(text.starts_with("mtllib parts.mtl\nv 0 0 0\n"));
+/// assert!(text.ends_with("g part-7\nusemtl part-7\nf 1 2 3\n"));
+/// ```
 ///
 /// # Panics
-///
 /// If there is not one label per polygon.
 pub fn obj<P: AsRef<[u32]>>(
     vertices: &[[f64; 3]],
@@ -67,6 +84,11 @@ pub fn obj<P: AsRef<[u32]>>(
 }
 
 /// Materials for [`obj`], as MTL text: a name and a diffuse sRGB colour each.
+///
+/// ```
+/// let text = coseg_geometry::mesh::write::mtl(&[("leg".to_string(), [255, 0, 0])]);
+/// assert_eq!(text, "newmtl leg\nKd 1.0000 0.0000 0.0000\n");
+/// ```
 pub fn mtl(materials: &[(String, [u8; 3])]) -> String {
     let mut out = String::new();
     for (name, colour) in materials {
@@ -79,10 +101,19 @@ pub fn mtl(materials: &[(String, [u8; 3])]) -> String {
     out
 }
 
-/// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and `int label`.
+/// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and
+/// `int label`.
+///
+/// ```
+/// use coseg_geometry::mesh::{Format, parse, write};
+///
+/// let vertices = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+/// let bytes = write::ply(&vertices, &[[0, 1, 2, 3]], &[[255, 0, 0]], &[7]);
+/// assert_eq!(parse(&bytes, Format::Ply)?.polygons(), [[0, 1, 2, 3]]);
+/// # Ok::<_, coseg_geometry::mesh::ParseError>(())
+/// ```
 ///
 /// # Panics
-///
 /// If there is not one colour and one label per polygon.
 pub fn ply<P: AsRef<[u32]>>(
     vertices: &[[f64; 3]],
@@ -131,6 +162,12 @@ pub fn ply<P: AsRef<[u32]>>(
 }
 
 /// An array of int32 `(n,)` as NumPy reads it (format version 1.0).
+///
+/// ```
+/// let bytes = coseg_geometry::mesh::write::npy(&[1, -1]);
+/// assert!(bytes.starts_with(b"\x93NUMPY"));
+/// assert_eq!(bytes[bytes.len() - 8..], [1, 0, 0, 0, 255, 255, 255, 255]);
+/// ```
 pub fn npy(values: &[i32]) -> Vec<u8> {
     // The data begin at a multiple of 64 bytes; magic, version and length take 10.
     let mut header = format!(
@@ -148,7 +185,11 @@ pub fn npy(values: &[i32]) -> Vec<u8> {
     out
 }
 
-/// A label for each polygon, one a line, as in Princeton's `.seg` files.
+/// The label of each polygon, one a line, as in Princeton's `.seg` files.
+///
+/// ```
+/// assert_eq!(coseg_geometry::mesh::write::seg(&[0, 0, 3]), "0\n0\n3\n");
+/// ```
 pub fn seg(labels: &[i32]) -> String {
     let mut out = String::with_capacity(3 * labels.len());
     for label in labels {

@@ -41,12 +41,22 @@ fn upright(up: Option<[f64; 3]>) -> (&'static str, &'static str) {
     }
 }
 
-/// A `.usda` file of one mesh, called `name` as far as USD allows. `material` gives the name and sRGB
-/// colour of a label. Faces keep their order; `primvars:label` has the label of each. The stage has the
-/// coordinate axis `up`, if it is known, and takes a unit for a metre, as glTF does.
+/// A `.usda` file of one mesh, called `name` as far as USD allows. `material` gives the name and
+/// sRGB colour of a label. Faces keep their order; `primvars:label` has the label of each. The
+/// stage has the coordinate axis `up`, if it is known, and takes a unit for a metre, as glTF does.
+///
+/// ```
+/// use coseg_geometry::mesh::{icosphere, write};
+///
+/// let sphere = icosphere(0);
+/// let labels = vec![3; sphere.faces.len()];
+/// let material = |label| (format!("part-{label}"), [200, 80, 40]);
+/// let text = write::usda("ball", &sphere.vertices, &sphere.faces, &labels, None, material);
+/// assert!(text.starts_with("#usda 1.0"));
+/// assert!(text.contains("def Xform \"ball\""));
+/// ```
 ///
 /// # Panics
-///
 /// If there is not one label per polygon.
 pub fn usda<P: AsRef<[u32]>>(
     name: &str,
