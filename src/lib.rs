@@ -1,7 +1,7 @@
 //! Keeps a growing library of 3D shapes consistently segmented and labelled.
 //!
 //! Data flows one way. [`pipeline::describe`] turns the bytes of one mesh into a [`pipeline::Description`]
-//! (pure, parallel, depends on the shape alone). [`pipeline::place`] relates a description to a bounded
+//! (pure, parallel, depends on the shape alone). [`pipeline::label`] relates a description to a bounded
 //! number of known shapes and labels its faces (pure, serial per collection). [`Library`] commits the
 //! result: the one effect. The daemon is a shell around [`Library`].
 

@@ -7,25 +7,26 @@ use std::path::Path;
 use std::process::Command;
 
 /// Pliers with their true labels, as the bench reads them.
-fn write_category(folder: &Path, count: u32) {
-    std::fs::create_dir(folder).unwrap();
+fn write_category(folder: &Path, count: u32) -> std::io::Result<()> {
+    std::fs::create_dir(folder)?;
     let options = Options {
         n_faces: 600,
         rotate: false,
     };
     for shape in family(Family::Pliers, 5, count, &options) {
         let path = folder.join(format!("{}.off", shape.name));
-        std::fs::write(path, off(&shape.mesh)).unwrap();
+        std::fs::write(path, off(&shape.mesh))?;
         let labels: String = shape.labels.iter().map(|l| format!("{l}\n")).collect();
         let path = folder.join(format!("{}.labels.txt", shape.name));
-        std::fs::write(path, labels).unwrap();
+        std::fs::write(path, labels)?;
     }
+    Ok(())
 }
 
 #[test]
 fn figures_come_as_json_for_each_category() {
     let data = tempfile::tempdir().unwrap();
-    write_category(&data.path().join("pliers"), 6);
+    write_category(&data.path().join("pliers"), 6).unwrap();
     let done = Command::new(env!("CARGO_BIN_EXE_coseg-bench"))
         .args(["labels", "--orders", "1", "--exemplars", "0,1"])
         .args(["--no-baselines", "--json", "--data"])

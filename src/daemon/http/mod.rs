@@ -404,12 +404,13 @@ impl Server {
             }
             Ok(hands::Kept { it: bytes, memory })
         };
-        tokio::time::timeout(PEER_TIME, collected)
-            .await
-            .unwrap_or_else(|_| {
+        match tokio::time::timeout(PEER_TIME, collected).await {
+            Ok(done) => done,
+            Err(_) => {
                 let why = format!("the body did not arrive within {} s", PEER_TIME.as_secs());
                 Err(text(StatusCode::REQUEST_TIMEOUT, &why))
-            })
+            }
+        }
     }
 
     /// Asks what a client of the sockets could ask, on the same way: the same order, limits and
