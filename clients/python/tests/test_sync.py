@@ -378,7 +378,7 @@ def test_messages_beyond_the_limit_are_not_sent(meshes: list[Path]) -> None:
             collection = lib.collection("c")
             with pytest.raises(coseg.BadMesh, match="the limit is 32 KiB"):
                 collection.add("large", coseg.Encoded("off", b"x" * 40_000))
-            with pytest.raises(coseg.CosegError, match="the daemon's limit is 64 KiB"):
+            with pytest.raises(coseg.CosegError, match="the limit is 64 KiB"):
                 lib.call("create_collection", [b"x" * 70_000], spec={"name": "c"})
             assert lib.collections() == []
     finally:
