@@ -7,6 +7,8 @@ use coseg::daemon::{self, Running};
 use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::PathBuf;
 use std::time::Duration;
 use tracing_subscriber::EnvFilter;
@@ -39,7 +41,11 @@ impl Session {
     /// Starts the daemon; each answer is waited for `patience`.
     pub(crate) fn start(patience: Duration) -> Result<Self, BenchError> {
         let temporary = std::env::temp_dir();
-        let folder = tempfile::Builder::new().prefix("coseg-bench-").tempdir();
+        // The daemon's socket is in it: nobody else may enter.
+        let folder = tempfile::Builder::new()
+            .prefix("coseg-bench-")
+            .permissions(Permissions::from_mode(0o700))
+            .tempdir();
         let folder = folder.map_err(|e| BenchError::file(&temporary, e))?;
         let mut config = Config::default();
         config.server.endpoint = format!("ipc://{}/coseg.sock", folder.path().display());
