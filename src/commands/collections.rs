@@ -36,7 +36,8 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
                 value["changed"] = done.changed.into();
                 session.print_json(&value)?;
             } else {
-                let (axis, undo) = (json::up(*up), "`coseg undo` takes this back");
+                let axis = json::up(*up);
+                let undo = format!("`coseg undo -c {name}` takes this back");
                 eprintln!(
                     "{}",
                     match done.changed {

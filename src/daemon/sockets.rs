@@ -12,6 +12,7 @@ use crate::daemon::requests::Answer;
 use crate::daemon::{Counters, StartError};
 use crate::ipc::convert;
 use crate::ipc::endpoint::{Endpoint, claim_socket};
+use crate::ipc::fields::{self, MAX_FIELDS};
 use crate::ipc::frames::{self, FrameLimits};
 use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, Reply, Request, reply};
@@ -27,7 +28,7 @@ use zmq_bounds::Bounds;
 /// Raw frames of one message; a shape takes at most two.
 pub(crate) const MAX_FRAMES: usize = 1_024;
 /// Bytes of a header frame.
-pub(crate) const MAX_HEADER_BYTES: u64 = 4 << 20;
+pub(crate) const MAX_HEADER_BYTES: u64 = 1 << 20;
 /// What a header takes when it is decoded, by its bytes, and a frame beside its bytes.
 const DECODED: u64 = 8;
 const FRAME_COST: u64 = 256;
@@ -55,12 +56,15 @@ const HEARTBEAT_TIMEOUT_MS: i32 = 30_000;
 const LINGER_MS: i32 = 1_000;
 /// Milliseconds after which the thread looks around even if nothing came, for the watchdog.
 const POLL_MS: i64 = 500;
-/// Requests read before replies get their turn.
+/// Requests, and bytes of their headers, that are read before replies get their turn.
 const READ_BATCH: usize = 64;
+const READ_BATCH_BYTES: usize = 256 << 10;
 /// Milliseconds in which a connection must have said who it is.
 const HANDSHAKE_MS: i32 = 5_000;
 /// How long an address that was just given back is tried at a time.
 const REBIND: Duration = Duration::from_millis(500);
+/// Pairs of ports that are tried where any will do.
+const MAX_PAIRS: u32 = 64;
 /// Connections that the kernel keeps until they are taken.
 const BACKLOG: i32 = 1_024;
 /// What a client that finds the queue or the memory full should wait.
@@ -185,8 +189,22 @@ pub(crate) fn bind(
             }
         }
     };
-    let endpoint = listen(&router, endpoint)?;
-    let events = listen(&publisher, &endpoint.events()?)?;
+    let any_port = matches!(endpoint, Endpoint::Tcp { port: 0, .. });
+    let mut n_pairs = 0;
+    let (endpoint, events) = loop {
+        let bound = listen(&router, endpoint)?;
+        n_pairs += 1;
+        match listen(&publisher, &bound.events()?) {
+            // Somebody has the port after it, which events need: another pair.
+            Err(StartError::Socket {
+                source: zmq::Error::EADDRINUSE,
+                ..
+            }) if any_port && n_pairs < MAX_PAIRS => {
+                router.unbind(&bound.to_string()).map_err(failed)?;
+            }
+            events => break (bound, events?),
+        }
+    };
     let (outbox, queue) = Outbox::new(wake_sender, replies);
     Ok(Bound {
         context,
@@ -321,10 +339,21 @@ impl SocketThread {
                     Outgoing::Stop => return,
                 }
             }
+            let mut read = 0;
             for _ in 0..READ_BATCH {
+                if read > READ_BATCH_BYTES {
+                    break;
+                }
                 let router = &self.bound.router;
                 match frames::receive_from(router, zmq::DONTWAIT, &self.limits, N_LEADING) {
-                    Ok((user, Ok(message))) => self.request(user, message),
+                    Ok((user, Ok(message))) => {
+                        read += message
+                            .iter()
+                            .take(N_LEADING)
+                            .map(Bytes::len)
+                            .sum::<usize>();
+                        self.request(user, message);
+                    }
                     Ok((_, Err((leading, e)))) => {
                         let Some((peer, header, _)) = split(leading) else {
                             continue;
@@ -417,6 +446,11 @@ impl SocketThread {
                 String::new(),
                 invalid(ErrorReason::MessageTooLarge, text),
             );
+        }
+        if fields::count(&header, MAX_FIELDS) > MAX_FIELDS {
+            let text = format!("the header frame has more than {MAX_FIELDS} fields, the limit");
+            let error = invalid(ErrorReason::MessageTooLarge, text);
+            return self.refuse(&peer, String::new(), error);
         }
         let request = match Request::decode(header) {
             Ok(request) => request,

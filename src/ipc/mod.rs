@@ -6,6 +6,7 @@
 pub mod client;
 pub mod convert;
 pub mod endpoint;
+pub mod fields;
 mod folder;
 pub mod frames;
 pub mod json;

@@ -5,15 +5,24 @@ use crate::ipc::wire::{Error, ErrorCode, ErrorReason, error::Subject};
 use crate::library::{Failure, FailureSubject, LibraryError};
 use crate::store::StoreError;
 
+/// Characters of an error's message.
+const MAX_MESSAGE_CHARS: usize = 2_000;
+
 /// Milliseconds after which a full disk is worth another try.
 const DISK_FULL_RETRY_MS: u64 = 10_000;
 
 /// An error without subject or retry delay.
 pub fn error(code: ErrorCode, reason: ErrorReason, message: impl Into<String>) -> Error {
+    let mut message = message.into();
+    // A name that a client sent may be as long as its message.
+    if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE_CHARS) {
+        message.truncate(end);
+        message.push('…');
+    }
     Error {
         code: code.into(),
         reason: reason.into(),
-        message: message.into(),
+        message,
         retry_after_ms: 0,
         subject: None,
     }

@@ -418,6 +418,7 @@ class App {
     $("close").onclick = () => this.go({ shape: null });
     $("previous").onclick = () => this.step(-1);
     $("next").onclick = () => this.step(1);
+    $("skip").onfocus = () => ($("skip").textContent = this.selected ? "Skip to the shape" : "Skip to the shapes");
     $("skip").onclick = () => (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
     $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
     $("undo").onclick = () => this.attempt(async () => {

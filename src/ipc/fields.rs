@@ -1,0 +1,127 @@
+//! Counts the fields of an encoded message before it is decoded.
+//!
+//! A field of two bytes can become hundreds when it is decoded: an empty message in a list, for
+//! instance. What a header may become is therefore bounded by its fields as well as by its bytes.
+
+/// Fields of a header. The longest lists that a request may have stay far below.
+pub const MAX_FIELDS: usize = 100_000;
+
+/// Levels of messages within messages that are looked into; no field of a request is deeper.
+const MAX_DEPTH: u32 = 6;
+
+/// Fields of an encoded message, with those of the messages within it; more than `limit` are not
+/// counted further. Text and bytes that could be a message count as one: there is no schema here.
+pub fn count(message: &[u8], limit: usize) -> usize {
+    let mut n = 0;
+    walk(message, MAX_DEPTH, limit, &mut n);
+    n
+}
+
+/// Adds the fields of `message` to `n`. Whether all of it is fields.
+fn walk(mut message: &[u8], depth: u32, limit: usize, n: &mut usize) -> bool {
+    while !message.is_empty() {
+        if *n > limit {
+            return true;
+        }
+        let Some(key) = varint(&mut message) else {
+            return false;
+        };
+        let length = match key & 7 {
+            0 => match varint(&mut message) {
+                Some(_) => 0,
+                None => return false,
+            },
+            1 => 8,
+            2 => match varint(&mut message) {
+                Some(length) => length,
+                None => return false,
+            },
+            // The ends of a group have no value.
+            3 | 4 => 0,
+            5 => 4,
+            _ => return false,
+        };
+        let Some((value, rest)) = usize::try_from(length)
+            .ok()
+            .and_then(|length| message.split_at_checked(length))
+        else {
+            return false;
+        };
+        message = rest;
+        *n += 1;
+        if key & 7 == 2 && depth > 0 {
+            let before = *n;
+            if !walk(value, depth - 1, limit, n) {
+                *n = before;
+            }
+        }
+    }
+    true
+}
+
+/// The variable-length integer that bytes begin with, which is taken from them.
+fn varint(bytes: &mut &[u8]) -> Option<u64> {
+    let mut value = 0;
+    for shift in (0..64).step_by(7) {
+        let (byte, rest) = bytes.split_first()?;
+        *bytes = rest;
+        value |= u64::from(byte & 127) << shift;
+        if byte & 128 == 0 {
+            return Some(value);
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_FIELDS, count};
+    use crate::ipc::wire::{AddShapesRequest, Request, ShapeInput, request::Body};
+    use prost::Message as _;
+
+    fn addition(n: usize) -> Vec<u8> {
+        let shapes = vec![ShapeInput::default(); n];
+        let request = AddShapesRequest {
+            collection: "chairs".to_owned(),
+            shapes,
+            ..Default::default()
+        };
+        let request = Request {
+            request_id: "7".to_owned(),
+            body: Some(Body::AddShapes(request)),
+            ..Default::default()
+        };
+        request.encode_to_vec()
+    }
+
+    #[test]
+    fn fields_of_messages_within_messages_count() {
+        // The id, the body, the collection; then each shape.
+        assert_eq!(count(&addition(0), MAX_FIELDS), 3);
+        assert_eq!(count(&addition(40), MAX_FIELDS), 43);
+        assert!(count(&addition(2 * MAX_FIELDS), MAX_FIELDS) > MAX_FIELDS);
+    }
+
+    #[test]
+    fn what_is_no_message_is_no_trouble() {
+        for bytes in [
+            &b""[..],
+            b"\xff",
+            b"\x0a",
+            b"\x0a\xff\xff\xff\xff\x0f",
+            b"\x07",
+        ] {
+            assert!(count(bytes, MAX_FIELDS) <= 1, "{bytes:?}");
+        }
+        // Messages in messages without end are not followed without end.
+        let mut deep = Vec::new();
+        for _ in 0..10_000 {
+            let length = deep.len();
+            let mut outer = vec![0x0a];
+            prost::encoding::encode_varint(length as u64, &mut outer);
+            outer.append(&mut deep);
+            deep = outer;
+        }
+        assert!(count(&deep, MAX_FIELDS) < 10);
+    }
+}
