@@ -506,7 +506,7 @@ fault(
 fault(
     "R13", "r13-all-files", "leave no files beside those of connections",
     "src/daemon/sockets.rs", "it daemon::flood::ten_thousand_connections_leave_a_good_client_served",
-    ("    let kept = KEPT_FILES.min(files / 2);", "    let kept = if FAULT { 0 } else { KEPT_FILES.min(files / 2) };"),
+    ("(files - kept).min(", "(if FAULT { files } else { files - kept }).min("),
 )
 # R14: the unit
 fault(
