@@ -1,14 +1,14 @@
-//! What was typed becomes one command with typed flags.
+//! Parses the command line into one command with typed flags.
 
 mod care;
-mod carrying;
+mod maps;
 mod corrections;
 mod looking;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
-pub(crate) use carrying::{Map, Transfer};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
+pub(crate) use maps::{Map, Transfer};
 
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
@@ -20,13 +20,13 @@ use coseg::operators;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Exit codes, as `coseg --help` tells them.
+/// Exit codes, as listed by `coseg --help`.
 pub(crate) mod exit {
-    /// Something failed: a shape was refused, what was named is not there, a check found damage.
+    /// Something failed: a shape was refused, a named item does not exist, a check found damage.
     pub(crate) const FAILED: u8 = 1;
     /// The command line or the configuration is wrong; clap uses the same.
     pub(crate) const USAGE: u8 = 2;
-    /// No answer from a daemon within the timeout.
+    /// No daemon answered within the timeout.
     pub(crate) const NO_ANSWER: u8 = 3;
 }
 
@@ -49,10 +49,11 @@ pub(crate) struct Cli {
     pub(crate) command: Command,
 }
 
-/// Flags of every command.
+/// Flags that every command accepts.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Global {
-    /// Where the daemon is: ipc://PATH or tcp://HOST:PORT [default: the daemon's own default socket]
+    /// Address of the daemon: ipc://PATH or tcp://HOST:PORT [default: the daemon's own default
+    /// socket]
     #[arg(
         long,
         global = true,
@@ -61,7 +62,8 @@ pub(crate) struct Global {
         hide_env_values = true
     )]
     pub(crate) endpoint: Option<String>,
-    /// The daemon's public key, if it has keys: server.pub, as `coseg keys generate --server` made it
+    /// The daemon's public key, if it has keys: the server.pub that `coseg keys generate --server`
+    /// writes
     #[arg(
         long,
         global = true,
@@ -70,7 +72,7 @@ pub(crate) struct Global {
         hide_env_values = true
     )]
     pub(crate) server_key: Option<PathBuf>,
-    /// This client's keys, as `coseg keys generate NAME` made them
+    /// This client's keys, as written by `coseg keys generate NAME`
     #[arg(
         long,
         global = true,
@@ -79,10 +81,10 @@ pub(crate) struct Global {
         hide_env_values = true
     )]
     pub(crate) client_key: Option<PathBuf>,
-    /// Seconds to wait for an answer; work that goes on is waited for all the same
+    /// Seconds to wait for an answer; the command still waits for running work beyond that
     #[arg(long, global = true, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
     pub(crate) timeout: Duration,
-    /// Print JSON, and nothing else, on stdout
+    /// Print only JSON on stdout
     #[arg(long, global = true)]
     pub(crate) json: bool,
 }
@@ -97,94 +99,95 @@ pub(crate) fn seconds(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// What to do.
+/// The command to run.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     /// Run the daemon
     Serve(Serve),
     /// Add meshes, and wait until they are labelled
     Add(Add),
-    /// Wait until a collection has nothing left to do
+    /// Wait until a collection has no work left
     Wait(Wait),
     /// List collections, or the shapes of one
     Ls(Ls),
-    /// Show one shape, or the collection
+    /// Show one shape, or the collection if no shape is named
     Show(Show),
     /// Print a shape's labels, one for each face of its file
     Labels(Labels),
     /// Write labels, or coloured meshes, of a collection to a folder
     Export(Export),
-    /// Draw a collection in the colours of its labels, as one PNG
+    /// Draw a collection in the colours of its labels as one PNG
     Render(Render),
-    /// Write the viewer with a collection as one HTML file, which needs nothing else
+    /// Write a collection with the viewer as one self-contained HTML file
     View(View),
-    /// Show the functional map from one shape to another and which parts it matches
+    /// Show the functional map between two shapes and the parts that it matches
     Map(Map),
-    /// Carry labels or functions at the faces of one shape to those of another
+    /// Transfer labels or functions at the faces of one shape to another
     Transfer(Transfer),
-    /// List the shapes most like one shape
+    /// List the shapes most similar to one shape
     Nearest(Nearest),
     /// Remove shapes
     Rm(Rm),
     /// Follow events as they happen
     Watch(Watch),
-    /// List events of a collection's log
+    /// List the events in a collection's log
     Events(Events),
-    /// Say which shape is worth labelling by hand next, and why
+    /// Name the shape most worth labelling by hand next, and the reason
     Suggest(Suggest),
-    /// Label a shape by hand, and carry that to all others
+    /// Label a shape by hand, and propagate that to all others
     Correct(Correct),
     /// Give a label a name
     Name(Name),
-    /// Make one label of two
+    /// Merge two labels into one
     Merge(Merge),
-    /// Make two labels of one
+    /// Split one label into two
     Split(Split),
-    /// Take back the newest correction, name, merge, split or change of the up axis; repeat to go further back
+    /// Undo the newest correction, name, merge, split or change of the up axis; repeat to go
+    /// further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]
     Collections(Collections),
     /// Show counters of the daemon
     Stats,
-    /// Follow queue, rates and stages of the daemon, as they change
+    /// Follow queue, rates and stages of the daemon
     Top(Top),
-    /// Let the daemon finish what it is at and stop
+    /// Let the daemon finish its current work and stop
     Stop(Stop),
     /// Compute the spectrum and descriptors of one mesh, without a daemon
     Describe(Describe),
-    /// Make a family of labelled shapes
+    /// Generate a family of labelled shapes
     Synth(SynthArgs),
-    /// Run the main job on a made family, end to end, in a temporary library
+    /// Run the whole pipeline on a generated family, in a temporary library
     Demo(DemoArgs),
-    /// List jobs, or the shapes that failed and why
+    /// List jobs, or the failed shapes with their errors
     Jobs(Jobs),
     /// Queue the failed shapes of a job again
     Retry(Retry),
-    /// Cancel the shapes of a job that are not placed yet
+    /// Cancel the shapes of a job that are not yet placed
     Cancel(Cancel),
-    /// Make keys, and say who may connect
+    /// Generate keys, and manage the clients that may connect
     Keys(Keys),
-    /// Describe shapes for a daemon, which starts this by itself
+    /// Describe shapes for a daemon, which starts this command itself
     #[command(hide = true)]
     Worker,
     /// Verify a library's files against its catalog; needs no daemon, and may run beside one
     Check(Check),
-    /// Copy a library, also while a daemon uses it, and verify the copy; needs no daemon
+    /// Copy a library, even while a daemon uses it, and verify the copy; needs no daemon
     Snapshot(Snapshot),
-    /// Make a library of a snapshot
+    /// Create a library from a snapshot
     Restore(Restore),
     /// Check or show the daemon's configuration
     #[command(subcommand)]
     Config(ConfigCommand),
     /// Print the completions of a shell
     Completions {
-        /// For which shell
+        /// The shell
         shell: clap_complete::Shell,
     },
     /// Print the manual page, or write one for each command
     Man {
-        /// Folder to write all pages to, created if missing
+        /// Folder for all pages, created if missing
         #[arg(long, value_name = "DIR")]
         out: Option<PathBuf>,
     },
@@ -193,28 +196,29 @@ pub(crate) enum Command {
 /// `coseg serve`
 #[derive(Debug, Args)]
 pub(crate) struct Serve {
-    /// Folder of the library, created if missing [default: as `coseg config show` says]
+    /// Folder of the library, created if missing [default: shown by `coseg config show`]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) file: ConfigFile,
-    /// Folder of keys: connections are encrypted and authenticated, also beyond this machine
+    /// Folder of keys; with keys, connections are encrypted and authenticated, also from other
+    /// machines
     #[arg(long, value_name = "DIR")]
     pub(crate) keys: Option<PathBuf>,
     /// Serve the viewer, /metrics, /healthz and /readyz over HTTP, at a loopback address such as
-    /// 127.0.0.1:8640; keys do not cover it, and beyond loopback (http.allow_remote) it asks for a
+    /// 127.0.0.1:8640. Keys do not protect it; beyond loopback (http.allow_remote) it asks for a
     /// token
     #[arg(long, value_name = "HOST:PORT")]
     pub(crate) http: Option<String>,
-    /// Threads that describe shapes; 0: one for each processor
+    /// Number of threads that describe shapes; 0: one for each processor
     #[arg(long, value_name = "N")]
     pub(crate) workers: Option<usize>,
-    /// error, warn, info, debug or trace
+    /// Level of the log: error, warn, info, debug or trace
     #[arg(long, value_name = "LEVEL")]
     pub(crate) log_level: Option<String>,
 }
 
-/// Which configuration file.
+/// The flag for the configuration file.
 #[derive(Debug, Args)]
 pub(crate) struct ConfigFile {
     /// Configuration file [default: /etc/coseg/coseg.toml if it exists]
@@ -222,21 +226,21 @@ pub(crate) struct ConfigFile {
     pub(crate) config: Option<PathBuf>,
 }
 
-/// Which collection.
+/// The flag for the collection.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct InCollection {
-    /// The collection; may be left out if there is only one
+    /// The collection; optional if there is only one
     #[arg(long, short, value_name = "NAME")]
     pub(crate) collection: Option<String>,
 }
 
-/// Which collection, of a command that names nothing else by its place.
+/// The collection, for commands without another positional argument.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct OneCollection {
-    /// The collection; may be left out if there is only one, or where all are meant
+    /// The collection; optional if there is only one, or to select all
     #[arg(id = "COLLECTION", value_name = "COLLECTION")]
     name: Option<String>,
-    /// The same
+    /// The collection, as a flag
     #[arg(
         long = "collection",
         short,
@@ -247,7 +251,7 @@ pub(crate) struct OneCollection {
 }
 
 impl OneCollection {
-    /// The one that was named, in either way.
+    /// The named collection, however it was given.
     pub(crate) fn named(&self) -> Option<&String> {
         self.name.as_ref().or(self.collection.as_ref())
     }
@@ -266,7 +270,7 @@ pub(crate) struct Wait {
     pub(crate) of: OneCollection,
 }
 
-/// Settings of a collection; those not given take their defaults, or are as they are.
+/// Settings of a collection. Omitted settings take their defaults, or stay unchanged.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Settings {
     /// Number of part kinds, 1 to 64; 0: estimated [default: estimated]
@@ -275,16 +279,16 @@ pub(crate) struct Settings {
     /// The axis that points up in every file: +x -x +y -y +z -z unknown auto [default: unknown]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
     pub(crate) up: Option<wire::Up>,
-    /// Which Laplacian [default: tufted]
+    /// The Laplacian [default: tufted]
     #[arg(long, value_name = "OPERATOR")]
     pub(crate) operator: Option<Operator>,
-    /// Faces of the working resolution [default: the daemon's]
+    /// Number of faces of the working resolution [default: the daemon's]
     #[arg(long, value_name = "N")]
     pub(crate) working_faces: Option<u32>,
 }
 
 impl Settings {
-    /// As a collection's specification, in which nothing that was not given is set.
+    /// Converts to a collection's specification, in which omitted settings are not set.
     pub(crate) fn to_spec(&self, name: &str) -> wire::CollectionSpec {
         wire::CollectionSpec {
             name: name.to_owned(),
@@ -299,7 +303,7 @@ impl Settings {
     }
 }
 
-/// A number of part kinds, as far as that can be told without the daemon.
+/// Parses a number of part kinds, and checks the limits that are known without the daemon.
 pub(crate) fn parts(text: &str) -> Result<u32, String> {
     let why = "the number of part kinds is 1 to 64; 0, or no --parts, lets it be estimated";
     match text.parse() {
@@ -334,7 +338,7 @@ pub(crate) enum Operator {
 }
 
 impl Operator {
-    /// As it is typed.
+    /// The name on the command line.
     pub(crate) fn name(operator: operators::Operator) -> &'static str {
         match operator {
             operators::Operator::Tufted => "tufted",
@@ -363,21 +367,22 @@ impl Operator {
 /// `coseg add`
 #[derive(Debug, Args)]
 pub(crate) struct Add {
-    /// Mesh files (.obj, .off, .ply, .stl, .glb, .gltf), or folders of them; a shape's name is its file's stem
+    /// Mesh files (.obj, .off, .ply, .stl, .glb, .gltf), or folders of them; a shape takes the name
+    /// of its file without the extension
     #[arg(required = true, value_name = "PATH")]
     pub(crate) paths: Vec<PathBuf>,
-    /// Also meshes in subfolders: a/b/1.obj below a named folder becomes the shape a__b__1
+    /// Also add meshes in subfolders: a/b/1.obj below a named folder becomes the shape a__b__1
     #[arg(long, short)]
     pub(crate) recursive: bool,
-    /// The collection, created if missing; without it the only one there is, or a new one named default
+    /// The collection, created if missing [default: the only one, or a new one named default]
     #[arg(long, short, value_name = "NAME")]
     pub(crate) collection: Option<String>,
     #[command(flatten)]
     pub(crate) settings: Settings,
-    /// Replace shapes of the same name that have other bytes
+    /// Replace shapes of the same name whose bytes differ
     #[arg(long)]
     pub(crate) replace: bool,
-    /// Return when the shapes are accepted, not when they are labelled
+    /// Return once the shapes are accepted, before they are labelled
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -388,7 +393,7 @@ pub(crate) struct Ls {
     /// List the shapes of this collection
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// Only shapes that carry this label, an id or a name
+    /// Only shapes that have this label, an id or a name
     #[arg(long, value_name = "LABEL")]
     pub(crate) label: Option<String>,
 }
@@ -396,7 +401,7 @@ pub(crate) struct Ls {
 /// `coseg show`
 #[derive(Debug, Args)]
 pub(crate) struct Show {
-    /// The shape; without it the collection is shown
+    /// The shape [default: show the collection]
     pub(crate) shape: Option<String>,
     #[command(flatten)]
     pub(crate) within: InCollection,
@@ -412,10 +417,10 @@ pub(crate) struct Labels {
     /// An earlier version of the labels
     #[arg(long, value_name = "N")]
     pub(crate) version: Option<u64>,
-    /// Print the probability of each label beside it
+    /// Print the probability of each label beside the label
     #[arg(long)]
     pub(crate) confidence: bool,
-    /// Do not wait for shapes and relabellings that are queued
+    /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -427,21 +432,21 @@ pub(crate) struct Export {
     pub(crate) shapes: Vec<String>,
     #[command(flatten)]
     pub(crate) within: InCollection,
-    /// What to write for each shape
+    /// The format to write for each shape
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: ExportFormat,
-    /// Folder to write to, created if missing
+    /// Folder for the files, created if missing
     #[arg(long, short, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Do not wait for shapes and relabellings that are queued
+    /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
 
-/// What `coseg export` writes.
+/// The formats of `coseg export`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum ExportFormat {
-    /// NAME.labels.txt: a label for each face of the file, one a line; -1: unlabelled
+    /// NAME.labels.txt: a label for each face of the file, one on each line; -1: unlabelled
     Labels,
     /// NAME.ply: the mesh with a colour and an int label for each face
     Ply,
@@ -455,7 +460,7 @@ pub(crate) enum ExportFormat {
     Npy,
     /// NAME.labels.json: the labels and their names
     Json,
-    /// NAME.seg: as labels, under the name that Princeton's tools expect
+    /// NAME.seg: the same text as labels, under the name that Princeton's tools expect
     Seg,
 }
 
@@ -466,7 +471,7 @@ pub(crate) struct Nearest {
     pub(crate) shape: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
-    /// At most this many
+    /// Maximum number of shapes
     #[arg(long, short = 'n', value_name = "N", default_value_t = 5)]
     pub(crate) limit: u32,
 }
@@ -479,7 +484,7 @@ pub(crate) struct Rm {
     pub(crate) shapes: Vec<String>,
     #[command(flatten)]
     pub(crate) within: InCollection,
-    /// Do not ask; without a terminal nothing is asked anyway
+    /// Do not ask for confirmation; without a terminal the command never asks
     #[arg(long, short)]
     pub(crate) yes: bool,
 }
@@ -490,10 +495,10 @@ pub(crate) struct Watch {
     /// Only this collection
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// Begin with the events of a collection after this number [default: with the next one]
+    /// Start after this sequence number [default: with the next event]
     #[arg(long, value_name = "SEQUENCE")]
     pub(crate) since: Option<u64>,
-    /// End after this many events
+    /// Exit after this many events
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
 }
@@ -503,10 +508,10 @@ pub(crate) struct Watch {
 pub(crate) struct Events {
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// Events after this number
+    /// Only events after this sequence number
     #[arg(long, value_name = "SEQUENCE", default_value_t = 0)]
     pub(crate) since: u64,
-    /// At most this many
+    /// Maximum number of events
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
 }
@@ -514,9 +519,9 @@ pub(crate) struct Events {
 /// `coseg name`
 #[derive(Debug, Args)]
 pub(crate) struct Name {
-    /// The label: its id, or the name it has
+    /// The label: its id, or its present name
     pub(crate) label: String,
-    /// The name it gets
+    /// The new name
     pub(crate) name: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
@@ -532,14 +537,15 @@ pub(crate) enum Collections {
         #[command(flatten)]
         settings: Settings,
     },
-    /// Change which way is up; labels are found again along the new axis, and faces labelled by hand keep theirs
+    /// Change the up axis; shapes are labelled again along the new axis, and faces labelled by hand
+    /// keep their labels
     Set {
         /// The collection
         name: String,
         /// The axis that points up in every file: +x -x +y -y +z -z unknown auto
         #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
         up: wire::Up,
-        /// Return when the axis is set, not when all shapes are labelled anew
+        /// Return once the axis is set, before the shapes are labelled again
         #[arg(long)]
         no_wait: bool,
     },
@@ -547,7 +553,7 @@ pub(crate) enum Collections {
     Delete {
         /// Its name
         name: String,
-        /// Do not ask; without a terminal nothing is asked anyway
+        /// Do not ask for confirmation; without a terminal the command never asks
         #[arg(long, short)]
         yes: bool,
     },
@@ -556,10 +562,11 @@ pub(crate) enum Collections {
 /// `coseg check`
 #[derive(Debug, Args)]
 pub(crate) struct Check {
-    /// Folder of the library [default: as `coseg config show` says]
+    /// Folder of the library [default: shown by `coseg config show`]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
-    /// Compute anew what is damaged and can be; put the damaged files aside. Not beside a daemon
+    /// Recompute damaged data where possible, and move the damaged files aside; not beside a
+    /// running daemon
     #[arg(long)]
     pub(crate) repair: bool,
 }
@@ -567,9 +574,9 @@ pub(crate) struct Check {
 /// `coseg config`
 #[derive(Debug, Subcommand)]
 pub(crate) enum ConfigCommand {
-    /// Say whether the daemon would start with it
+    /// Check whether the daemon would start with this configuration
     Check(ConfigFile),
-    /// Print what the daemon would use
+    /// Print the settings that the daemon would use
     Show(ConfigFile),
 }
 

@@ -1,4 +1,4 @@
-//! Flags of the commands for whoever looks after a daemon: keys, jobs, check, snapshots.
+//! Defines the flags of commands for operators of a daemon: keys, jobs, check, snapshots.
 
 use super::OneCollection;
 use clap::{Args, Subcommand};
@@ -20,37 +20,37 @@ pub(crate) struct Keys {
     pub(crate) command: KeysCommand,
 }
 
-/// What to do with keys.
+/// The subcommands of `coseg keys`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum KeysCommand {
-    /// Make the daemon's pair of keys, or a client's, which may then connect
+    /// Generate the daemon's pair of keys, or those of a client, which may then connect
     Generate {
-        /// The daemon's: server.key, server.pub and an empty allow list
+        /// Generate the daemon's keys: server.key, server.pub and an empty allow list
         #[arg(long, conflicts_with = "name")]
         server: bool,
         /// The client's name
         #[arg(required_unless_present = "server")]
         name: Option<String>,
-        /// What the client may do: read-only, ingest or admin
+        /// The client's role: read-only, ingest or admin
         #[arg(long, default_value = "ingest")]
         role: Role,
         /// The client's key file [default: NAME.key in the folder of keys]
         #[arg(long, value_name = "FILE", conflicts_with = "server")]
         out: Option<PathBuf>,
     },
-    /// Let a client in that has made its own keys
+    /// Allow a client that has generated its own keys to connect
     Allow {
-        /// Its public key, or a file with it
+        /// Its public key, or a file that contains it
         key: String,
         /// Its name
         name: String,
-        /// What it may do: read-only, ingest or admin
+        /// Its role: read-only, ingest or admin
         #[arg(long, default_value = "ingest")]
         role: Role,
     },
-    /// List who may connect
+    /// List the clients that may connect
     List,
-    /// Let a client in no more; a running daemon refuses it within a second
+    /// Revoke a client's key; a running daemon refuses it within a second
     Revoke {
         /// Its name or public key
         who: String,
@@ -60,13 +60,13 @@ pub(crate) enum KeysCommand {
 /// `coseg jobs`
 #[derive(Debug, Args)]
 pub(crate) struct Jobs {
-    /// Only shapes that failed, and why
+    /// Only failed shapes, with their errors
     #[arg(long)]
     pub(crate) failed: bool,
-    /// Only of this collection
+    /// Only jobs of this collection
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// At most this many jobs, the newest
+    /// Maximum number of jobs; the newest are listed
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
 }
@@ -74,9 +74,9 @@ pub(crate) struct Jobs {
 /// `coseg retry`
 #[derive(Debug, Args)]
 pub(crate) struct Retry {
-    /// The job, as `coseg jobs --failed` lists it
+    /// The job, as listed by `coseg jobs --failed`
     pub(crate) job: u64,
-    /// Return when its failed shapes are queued
+    /// Return once its failed shapes are queued
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -84,10 +84,10 @@ pub(crate) struct Retry {
 /// `coseg cancel`
 #[derive(Debug, Args)]
 pub(crate) struct Cancel {
-    /// The jobs, as `coseg jobs` lists them
+    /// The jobs, as listed by `coseg jobs`
     #[arg(value_name = "JOB", required_unless_present = "collection")]
     pub(crate) jobs: Vec<u64>,
-    /// Every job of this collection that is not finished
+    /// All unfinished jobs of this collection
     #[arg(long, short, value_name = "NAME", conflicts_with = "jobs")]
     pub(crate) collection: Option<String>,
 }
@@ -95,7 +95,7 @@ pub(crate) struct Cancel {
 /// `coseg stop`
 #[derive(Debug, Args)]
 pub(crate) struct Stop {
-    /// Return when the daemon has been told, not when it has ended
+    /// Return once the daemon has received the request, before it has ended
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -103,12 +103,12 @@ pub(crate) struct Stop {
 /// `coseg snapshot`
 #[derive(Debug, Args)]
 pub(crate) struct Snapshot {
-    /// Folder to make
+    /// Folder to create for the copy
     pub(crate) to: PathBuf,
-    /// Folder of the library [default: as `coseg config show` says]
+    /// Folder of the library [default: shown by `coseg config show`]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
-    /// Hard links in the place of copies: at once and without space, but damaged together
+    /// Use hard links instead of copies: fast and without extra space, but damage affects both
     #[arg(long)]
     pub(crate) link: bool,
 }
@@ -118,7 +118,7 @@ pub(crate) struct Snapshot {
 pub(crate) struct Restore {
     /// The snapshot
     pub(crate) from: PathBuf,
-    /// Folder of the library, missing or empty [default: as `coseg config show` says]
+    /// Folder of the library, missing or empty [default: shown by `coseg config show`]
     #[arg(long, value_name = "DIR")]
     pub(crate) library: Option<PathBuf>,
 }

@@ -1,4 +1,4 @@
-//! What a person types to correct labels.
+//! Defines the flags of commands that correct labels.
 
 use super::{InCollection, OneCollection};
 use clap::Args;
@@ -9,19 +9,19 @@ use std::path::PathBuf;
 pub(crate) struct Correct {
     /// The shape
     pub(crate) shape: String,
-    /// An integer a line for each face of the shape's file, in its order: its label; -1 leaves it
-    /// alone. Also .npy, .seg and .json as `coseg export` writes them
+    /// File with one integer on each line, the label of each face of the shape's file in its order;
+    /// -1 leaves a face unchanged. Also .npy, .seg and .json as written by `coseg export`
     #[arg(value_name = "LABELS", required_unless_present = "part")]
     pub(crate) labels: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) within: InCollection,
-    /// Label one part, numbered from 0 as `coseg show` lists them, instead of reading a file
+    /// Label one part, numbered from 0 as in `coseg show`, instead of reading a file
     #[arg(long, value_name = "N", requires = "label", conflicts_with = "labels")]
     pub(crate) part: Option<u32>,
-    /// The label of that part: an id, or the name of a label that is there
+    /// The label of that part: an id, or the name of an existing label
     #[arg(long, value_name = "LABEL", requires = "part")]
     pub(crate) label: Option<String>,
-    /// Return when the correction is durable, not when it is carried to the other shapes
+    /// Return once the correction is durable, before it has been propagated to the other shapes
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -29,9 +29,9 @@ pub(crate) struct Correct {
 /// `coseg merge`
 #[derive(Debug, Args)]
 pub(crate) struct Merge {
-    /// The label that goes: its id or name
+    /// The label that is retired: its id or name
     pub(crate) label: String,
-    /// The label that stands for both: its id or name
+    /// The label that replaces it: its id or name
     pub(crate) into: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
@@ -44,7 +44,7 @@ pub(crate) struct Split {
     pub(crate) label: String,
     #[command(flatten)]
     pub(crate) within: InCollection,
-    /// Return when the label is split, not when all shapes are labelled anew
+    /// Return once the label is split, before all shapes are labelled again
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -54,7 +54,7 @@ pub(crate) struct Split {
 pub(crate) struct Undo {
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// Return when the change is undone, not when shapes that came since are labelled anew
+    /// Return once the change is undone, before later shapes are labelled again
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -64,7 +64,7 @@ pub(crate) struct Undo {
 pub(crate) struct Suggest {
     #[command(flatten)]
     pub(crate) of: OneCollection,
-    /// Do not wait for shapes and relabellings that are queued
+    /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -77,10 +77,10 @@ pub(crate) struct Render {
     /// The PNG file to write
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: PathBuf,
-    /// At most this many shapes, in the order of their arrival
+    /// Maximum number of shapes, in the order of their arrival
     #[arg(long, value_name = "N")]
     pub(crate) max: Option<usize>,
-    /// Do not wait for shapes and relabellings that are queued
+    /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
 }

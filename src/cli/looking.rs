@@ -1,4 +1,4 @@
-//! What a person types to look at a library or at the daemon.
+//! Defines the flags of commands that show a library or the daemon.
 
 use super::OneCollection;
 use clap::Args;
@@ -12,16 +12,16 @@ pub(crate) struct View {
     /// The HTML file to write
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: PathBuf,
-    /// At most this many shapes, in the order of their arrival
+    /// Maximum number of shapes, in the order of their arrival
     #[arg(long, value_name = "N")]
     pub(crate) max: Option<usize>,
-    /// Shapes that come with eigenfunctions and heat kernel signature, about 70 kB each
+    /// Number of shapes with eigenfunctions and heat kernel signature, about 70 kB each
     #[arg(long, value_name = "N", default_value_t = 40)]
     pub(crate) functions: usize,
-    /// Shapes that come with functional maps, two each of about 7 kB
+    /// Number of shapes with functional maps, two for each, of about 7 kB
     #[arg(long, value_name = "N", default_value_t = 40)]
     pub(crate) maps: usize,
-    /// Do not wait for shapes and relabellings that are queued
+    /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
 }
@@ -29,10 +29,10 @@ pub(crate) struct View {
 /// `coseg top`
 #[derive(Debug, Args)]
 pub(crate) struct Top {
-    /// Seconds between looks
+    /// Seconds between updates
     #[arg(long, short, value_name = "SECONDS", default_value = "1", value_parser = super::seconds)]
     pub(crate) interval: std::time::Duration,
-    /// End after this many looks
+    /// Exit after this many updates
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
 }

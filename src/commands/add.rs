@@ -1,7 +1,8 @@
-//! `coseg add`: mesh files become labelled shapes.
+//! `coseg add` sends mesh files to the daemon, which labels them.
 //!
-//! Files are sent in batches, a few jobs ahead of the one being waited for, so that the daemon always
-//! has something to describe. The same command again resumes: what is there is `unchanged`.
+//! Files are sent in batches, a few jobs ahead of the job whose result is awaited, so that the
+//! daemon always has shapes to describe. Running the same command again resumes: stored shapes are
+//! `unchanged`.
 
 use super::collections::warn_of_up;
 use super::mesh_files::{self, Found, MeshFile, printable};
@@ -18,15 +19,16 @@ use serde_json::{Value, json};
 use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
 
-/// Shapes and bytes of one request: small enough that the first is at work while the next is read.
+/// Shapes and bytes of one request: small enough that the daemon works on the first while the next
+/// is read.
 const BATCH_SHAPES: usize = 16;
 const BATCH_BYTES: u64 = 16 << 20;
-/// Jobs that are sent ahead.
+/// Number of jobs that are sent ahead.
 const JOBS_AHEAD: usize = 4;
-/// Name of the collection that is created when none is named and there is none.
+/// Name of the collection that is created when none is named and none exists.
 const DEFAULT_COLLECTION: &str = "default";
 
-/// What became of the files so far.
+/// The results of the files so far.
 struct Report {
     json: bool,
     bar: ProgressBar,
@@ -66,7 +68,7 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     for (path, why) in refused {
         report.refused(&printable(&path), &why);
     }
-    // A batch that the whole queue cannot hold would be refused for ever.
+    // The daemon would always refuse a batch that exceeds its whole queue.
     let max_queued = usize::try_from(limits.max_queued_shapes).unwrap_or(usize::MAX);
     let max_shapes = BATCH_SHAPES
         .min(limits.max_shapes_per_request as usize)
@@ -111,7 +113,7 @@ pub(crate) fn run(args: &Add, mut session: Session) -> Outcome {
     report.finish(&collection, begin, described.as_ref(), &session)
 }
 
-/// Shapes of the next request.
+/// The shapes of the next request.
 #[derive(Default)]
 struct Batch {
     shapes: Vec<wire::ShapeInput>,
@@ -136,7 +138,7 @@ impl Batch {
     }
 }
 
-/// Sends a batch; a daemon that is full is asked again until it has room.
+/// Sends a batch, and repeats it while the daemon's queue is full.
 fn send(
     batch: &mut Batch,
     collection: &str,
@@ -163,7 +165,7 @@ fn send(
     Ok(())
 }
 
-/// What goes on in the daemon when the command ends now.
+/// The message about work that continues in the daemon if the command ends now.
 fn left_behind(collection: &str, jobs: &VecDeque<(u64, usize)>) -> String {
     let n: usize = jobs.iter().map(|(_, n)| n).sum();
     let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
@@ -175,7 +177,7 @@ fn left_behind(collection: &str, jobs: &VecDeque<(u64, usize)>) -> String {
     )
 }
 
-/// Waits for the oldest job and reports its shapes as they come, in order.
+/// Waits for the oldest job and reports its shapes in order, as they finish.
 fn finish_job(
     jobs: &mut VecDeque<(u64, usize)>,
     session: &mut Session,
@@ -236,7 +238,7 @@ fn accepted(
 }
 
 impl Report {
-    /// A file that was not even sent.
+    /// Reports a file that was not sent.
     fn refused(&mut self, name: &str, message: &str) {
         self.bar.suspend(|| eprintln!("coseg: {name}: {message}"));
         let error = json!({ "code": "INVALID_ARGUMENT", "reason": "NOT_SENT", "message": message });

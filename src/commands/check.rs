@@ -1,4 +1,5 @@
-//! `coseg check`, `coseg snapshot` and `coseg restore`: a library's files against its catalog, and copies.
+//! `coseg check` compares a library's files with its catalog; `coseg snapshot` and `coseg restore`
+//! copy libraries.
 
 use super::session::print_line;
 use super::{CommandError, Outcome};
@@ -20,7 +21,7 @@ pub(crate) fn run(args: &Check, global: &Global) -> Outcome {
     report(&directory, &findings, repaired.as_deref(), global.json)
 }
 
-/// The folder that was named, or the one of the configuration.
+/// The named folder, or the one in the configuration.
 fn library(named: Option<&PathBuf>) -> Result<PathBuf, CommandError> {
     Ok(match named {
         Some(directory) => directory.clone(),

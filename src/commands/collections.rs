@@ -1,4 +1,4 @@
-//! `coseg collections`: collections come, change and go.
+//! `coseg collections` creates, changes and deletes collections.
 
 use super::confirm::confirmed;
 use super::session::Session;
@@ -73,14 +73,15 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// Says on stderr if shapes seem to stand along another axis than the collection's.
+/// Warns on stderr if shapes seem to stand along another axis than the collection's.
 pub(crate) fn warn_of_up(c: &wire::Collection) {
     if let Some(text) = up_warning(c) {
         eprintln!("coseg: warning: {text}");
     }
 }
 
-/// What to say if shapes seem to stand along another axis than the one that was given, and what to do about it.
+/// The warning if shapes seem to stand along another axis than the given one, with the command that
+/// changes it.
 pub(crate) fn up_warning(c: &wire::Collection) -> Option<String> {
     let other = c.up_disagrees.as_ref()?;
     let spec = c.spec.as_ref()?;

@@ -1,4 +1,4 @@
-//! `coseg completions`: what a shell needs to complete commands and flags.
+//! `coseg completions` prints a script that lets a shell complete commands and flags.
 
 use super::{CommandError, Outcome};
 use crate::cli::Cli;

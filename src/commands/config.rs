@@ -1,4 +1,4 @@
-//! `coseg config`: what the daemon would do, without starting it.
+//! `coseg config` shows the settings of the daemon without starting it.
 
 use super::session::print_line;
 use super::{CommandError, Outcome};
@@ -45,7 +45,8 @@ pub(crate) fn run(command: &ConfigCommand, global: &Global) -> Outcome {
     Ok(true)
 }
 
-/// Sections of scalars and lists of scalars; JSON's strings, numbers and lists are TOML's.
+/// Writes sections of scalars and lists of scalars as TOML; JSON's strings, numbers and lists are
+/// valid TOML.
 fn to_toml(settings: &Value) -> String {
     let mut text = String::new();
     for (section, keys) in settings.as_object().into_iter().flatten() {

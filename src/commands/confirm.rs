@@ -1,10 +1,10 @@
-//! What cannot be undone is asked about, where somebody is there to answer.
+//! Asks for confirmation before actions that cannot be undone, if stdin is a terminal.
 
 use super::CommandError;
 use std::io::{IsTerminal as _, Write as _, stderr, stdin};
 
-/// Whether to go on: asked on a terminal, unless `yes` says so. A script is not asked: there the
-/// command is the answer.
+/// Whether to continue: asks on a terminal, unless `yes` is set. A script is not asked, since its
+/// command line is the confirmation.
 pub(super) fn confirmed(question: &str, yes: bool) -> Result<bool, CommandError> {
     if yes || !stdin().is_terminal() || !stderr().is_terminal() {
         return Ok(true);

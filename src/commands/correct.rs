@@ -1,4 +1,4 @@
-//! `coseg correct`: a person's labels of a shape, carried to all others.
+//! `coseg correct` sends a person's labels of a shape, which the daemon propagates to all others.
 
 use super::session::Session;
 use super::{CommandError, Outcome, label_file};

@@ -1,7 +1,8 @@
-//! `coseg demo`: a made-up family goes through a daemon of its own, and what came out is compared with
-//! what is known.
+//! `coseg demo` streams a generated family through a daemon of its own, and compares the results
+//! with the known parts.
 //!
-//! The daemon runs in this process, but every byte goes through its socket, as between two programs.
+//! The daemon runs in this process, but every byte goes through its socket, as between two
+//! programs.
 
 use super::session::{Session, print_line, table};
 use super::{CommandError, Outcome, demo_ply, json, labels};
@@ -22,24 +23,24 @@ use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Most faces of a shape; more take longer than a demonstration should.
+/// Maximum number of faces of a shape; more would take longer than a demonstration should.
 const MOST_FACES: i64 = 200_000;
-/// How long the daemon may take to end; it has nothing left to do by then.
+/// Time limit for the daemon's end; it has no work left by then.
 pub(super) const DRAIN_LIMIT: Duration = Duration::from_secs(30);
 
 /// `coseg demo`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArgs {
-    /// Which family; `coseg synth --list` shows them
+    /// The family; `coseg synth --list` lists all
     #[arg(default_value = "pliers")]
     family: Family,
-    /// How many shapes
+    /// Number of shapes
     #[arg(long, value_name = "N", default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..=1000))]
     count: u32,
-    /// Which members of the family
+    /// Seed that selects the members of the family
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Faces of each shape
+    /// Number of faces of each shape
     #[arg(
         long,
         value_name = "N",
@@ -47,23 +48,24 @@ pub(crate) struct DemoArgs {
         value_parser = clap::value_parser!(u32).range(i64::from(LEAST_FACES)..=MOST_FACES)
     )]
     faces: u32,
-    /// Turn each shape at random, and do not tell the daemon which way is up
+    /// Turn each shape at random, and do not set the up axis
     #[arg(long)]
     rotate: bool,
-    /// Number of part kinds the daemon is told; 0: it estimates [default: as many as the family has]
+    /// Number of part kinds that is set; 0: the daemon estimates it [default: that of the family]
     #[arg(long, value_name = "N", value_parser = parts, allow_hyphen_values = true)]
     parts: Option<u32>,
-    /// Folder for the coloured meshes, created if missing [default: a new one for temporary files]
+    /// Folder for the coloured meshes, created if missing [default: a new temporary folder]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 }
 
-/// A private folder that goes away with it.
+/// A private folder that is removed when this value is dropped.
 pub(super) struct Scratch(pub(super) PathBuf);
 
 impl Scratch {
     pub(super) fn create() -> Result<Self, CommandError> {
-        // Process ids come again, in containers all the time, and a killed demonstration cleans nothing.
+        // Process ids are reused, quickly in containers, and a killed demonstration leaves its
+        // folder behind.
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let (id, nanos) = (std::process::id(), since.map_or(0, |d| d.as_nanos()));
         let path = std::env::temp_dir().join(format!("coseg-demo-{id}-{nanos:x}"));
@@ -81,7 +83,7 @@ impl Drop for Scratch {
     }
 }
 
-/// One shape on its way: what is known of it and what the daemon said.
+/// A shape that was sent, with its known parts and the daemon's results.
 struct Sent {
     shape: Labelled,
     truth: Vec<i32>,
@@ -99,7 +101,7 @@ pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
     let shapes = coseg::synth::family(args.family, args.seed, args.count, &options);
     let made_seconds = begin.elapsed().as_secs_f64();
 
-    // Dropped after the daemon has ended, since that has files there.
+    // Dropped after the daemon has ended, because the daemon has files there.
     let scratch = Scratch::create()?;
     log_warnings()?;
     let running = start(&scratch.0)?;
@@ -135,7 +137,7 @@ pub(super) fn at(path: &Path, source: std::io::Error) -> CommandError {
     }
 }
 
-/// Logs warnings only; once in a process.
+/// Sets the log to warnings; once for each process.
 pub(super) fn log_warnings() -> Result<(), CommandError> {
     telemetry::start(&Log {
         level: "warn".to_owned(),
@@ -144,7 +146,7 @@ pub(super) fn log_warnings() -> Result<(), CommandError> {
     Ok(())
 }
 
-/// A daemon with default settings on an empty library.
+/// Starts a daemon with default settings on an empty library.
 pub(super) fn start(directory: &Path) -> Result<Running, CommandError> {
     let mut config = Config::default();
     config.server.endpoint = format!("ipc://{}/coseg.sock", directory.display());
@@ -152,7 +154,7 @@ pub(super) fn start(directory: &Path) -> Result<Running, CommandError> {
     Ok(daemon::start(config).map_err(ServeError::Start)?)
 }
 
-/// Sends the shapes one by one; each is labelled from those before it.
+/// Sends the shapes one by one; each is labelled from the previous ones.
 fn stream(
     args: &DemoArgs,
     shapes: Vec<Labelled>,
@@ -255,7 +257,7 @@ fn scored(sent: &[Sent]) -> Result<Score, CommandError> {
     score(&shapes).map_err(|e| CommandError::Failed(format!("labels cannot be scored: {e}")))
 }
 
-/// What became of one shape, in two lines.
+/// The result of one shape, in two lines.
 fn arrival(sent: &Sent, so_far: &Score) -> String {
     let (name, seconds) = (&sent.shape.name, sent.seconds);
     if sent.predicted.is_none() {
@@ -290,7 +292,7 @@ fn word(label: i32) -> String {
     }
 }
 
-/// Share of the area of each label, the largest first.
+/// Share of the area of each label, largest first.
 fn shares(sent: &Sent) -> Vec<(i32, f64)> {
     let mesh = &sent.shape.mesh;
     let mut areas: BTreeMap<i32, f64> = BTreeMap::new();
@@ -303,13 +305,14 @@ fn shares(sent: &Sent) -> Vec<(i32, f64)> {
     shares
 }
 
-/// Milliseconds by stage, as the daemon measured them.
+/// Milliseconds of each stage, as measured by the daemon.
 fn stages(sent: &Sent) -> Vec<(String, f64)> {
     let placed = sent.item.placed.iter().flat_map(|p| &p.stages);
     placed.map(|s| (s.stage.clone(), s.ms)).collect()
 }
 
-/// Waits for what is left to relabel, scores the final labels, writes the coloured meshes and says so.
+/// Waits for queued relabellings, scores the final labels, writes the coloured meshes and prints
+/// the results.
 fn finish(args: &DemoArgs, mut sent: Vec<Sent>, session: &mut Session) -> Outcome {
     let collection = args.family.name();
     let on_arrival = scored(&sent)?;

@@ -1,4 +1,5 @@
-//! Labelled shapes become coloured PLY files: one each, and one with all of them side by side.
+//! Writes labelled shapes as coloured PLY files: one for each shape, and one with all of them side
+//! by side.
 
 use super::export_mesh::colour;
 use coseg::ipc::wire::LabelInfo;
@@ -6,8 +7,8 @@ use coseg::mesh::TriMesh;
 use coseg::mesh::write::ply;
 use coseg::synth::Labelled;
 
-/// Colours of known parts, told apart from each other by people of all kinds of sight (M. Okabe and
-/// K. Ito, "Color universal design", 2008).
+/// Colours of known parts that people with any colour vision can distinguish (M. Okabe and K. Ito,
+/// "Color universal design", 2008).
 const KNOWN: [[u8; 3]; 8] = [
     [230, 159, 0],
     [86, 180, 233],
@@ -18,11 +19,11 @@ const KNOWN: [[u8; 3]; 8] = [
     [204, 121, 167],
     [0, 0, 0],
 ];
-/// Distance between shapes that stand side by side, in their own size.
+/// Distance between neighbouring shapes, relative to their size.
 const SPACING: f64 = 1.15;
 
-/// Names and bytes: `NAME.ply` in the colours of the labels, and `all.ply`, in which the known parts stand
-/// behind the found ones.
+/// Names and bytes of the files: `NAME.ply` in the colours of the labels, and `all.ply`, in which
+/// the shapes with known parts stand behind those with the found ones.
 pub(super) fn files(shapes: &[(&Labelled, &[i32])], infos: &[LabelInfo]) -> Vec<(String, Vec<u8>)> {
     let mut files = Vec::with_capacity(shapes.len() + 1);
     let mut all = Scene::default();
@@ -85,7 +86,7 @@ fn extent(mesh: &TriMesh) -> f64 {
     side(0).max(side(1)).max(side(2))
 }
 
-/// Several meshes as one.
+/// Several meshes, joined to one.
 #[derive(Default)]
 struct Scene {
     vertices: Vec<[f64; 3]>,

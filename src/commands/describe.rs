@@ -1,4 +1,4 @@
-//! `coseg describe`: the pure stage without a daemon.
+//! `coseg describe` runs the pure description stage on one mesh, without a daemon.
 
 use super::describe_full::{Signatures, full};
 use super::session::print_line;
@@ -27,41 +27,41 @@ pub(crate) struct Describe {
     /// Write the arrays to this safetensors file
     #[arg(long, short, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
-    /// Eigenpairs [default: 300, or a quarter of the vertices if that is fewer]
+    /// Number of eigenpairs [default: 300, or a quarter of the vertices if that is fewer]
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) k: Option<u32>,
-    /// Which Laplacian
+    /// The Laplacian
     #[arg(long, value_name = "OPERATOR", default_value = "tufted")]
     pub(crate) operator: crate::cli::Operator,
-    /// Only operator, spectrum and heat kernel signature, at input resolution and in double precision;
-    /// the file then also holds stiffness (CSR) and mass
+    /// Compute only operator, spectrum and heat kernel signature, at input resolution and in double
+    /// precision; the file then also contains stiffness (CSR) and mass
     #[arg(long)]
     pub(crate) full: bool,
-    /// Faces of the working resolution
+    /// Number of faces of the working resolution
     #[arg(long, value_name = "N", conflicts_with = "full")]
     pub(crate) working_faces: Option<u32>,
-    /// Threads; the result does not depend on it
+    /// Number of threads; the result does not depend on it
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub(crate) threads: u32,
-    /// Print the milliseconds of each stage, with --full also of each part of the solver
+    /// Print the milliseconds of each stage; with --full also of each step of the solver
     #[arg(long)]
     pub(crate) timings: bool,
 }
 
-/// Milliseconds by stage, in the order in which stages were first entered. What a stage `a.b` takes
-/// counts for `a` too; one that is entered again goes on counting.
+/// Milliseconds of each stage, in the order in which stages were first entered. The time of a stage
+/// `a.b` counts for `a` too, and repeated stages add up.
 #[derive(Default)]
 pub(super) struct Laps(RefCell<Running>);
 
 #[derive(Default)]
 struct Running {
     laps: Vec<(String, f64)>,
-    /// The lap that runs, and the one within it, each with when it was entered.
+    /// The running stages, outermost first, each with the time of entry.
     open: Vec<(usize, Instant)>,
 }
 
 impl Laps {
-    /// Ends the stages that `name` is not within, and begins this one.
+    /// Ends the stages that do not contain `name`, and begins this one.
     pub(super) fn enter(&self, name: &str) -> bool {
         let running = &mut *self.0.borrow_mut();
         let now = Instant::now();
@@ -88,7 +88,7 @@ impl Laps {
 }
 
 impl Running {
-    /// Ends all open laps but the first `keep`.
+    /// Ends all running stages but the first `keep`.
     fn close(&mut self, keep: usize, now: Instant) {
         while self.open.len() > keep {
             if let Some((at, since)) = self.open.pop() {
@@ -107,27 +107,28 @@ impl Running {
     }
 }
 
-/// What there is to do.
+/// The parameters of a description.
 pub(super) struct Task<'a> {
     /// The file's bytes and their format.
     pub(super) mesh: (&'a [u8], Format),
     pub(super) params: &'a Params,
-    /// Where what it takes is noted.
+    /// The times of the stages.
     pub(super) laps: &'a Laps,
-    /// Where arrays go.
+    /// The destination of the arrays.
     pub(super) out: Option<&'a Path>,
 }
 
-/// What there is to print.
+/// The results to print.
 pub(super) struct Summary {
     pub(super) area: f64,
     pub(super) n_vertices: usize,
     pub(super) n_faces: usize,
     pub(super) eigenvalues: Vec<f64>,
     pub(super) report: CleanReport,
-    /// Largest residual relative to its bound, and the proof of completeness; at input resolution only.
+    /// Largest residual relative to its bound, and the certificate of completeness; at input
+    /// resolution only.
     pub(super) spectrum: Option<(f64, Certificate)>,
-    /// What computing signatures amounted to; at input resolution, where they are written.
+    /// The cost of computing signatures; at input resolution, where they are written.
     pub(super) signatures: Option<Signatures>,
 }
 
@@ -172,7 +173,7 @@ pub(crate) fn run(args: &Describe, global: &Global) -> Outcome {
     Ok(true)
 }
 
-/// What went wrong with a mesh, or with the file that is written.
+/// The failure of a mesh, or of the output file.
 pub(super) enum Trouble {
     Mesh(String),
     Out(std::path::PathBuf, std::io::Error),
@@ -298,7 +299,7 @@ fn print(
     Ok(())
 }
 
-/// What is known of completeness, in words.
+/// The certificate of completeness as a sentence.
 fn proof(certificate: &Certificate) -> String {
     let Certificate {
         tau,

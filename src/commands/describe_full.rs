@@ -1,4 +1,5 @@
-//! `coseg describe --full`: operator, spectrum and signatures at input resolution, in double precision.
+//! `coseg describe --full` computes operator, spectrum and signatures at input resolution, in
+//! double precision.
 
 use super::describe::{Laps, Summary, Task, Trouble};
 use coseg::descriptors::{PointKernels, gps_scales, hks_times, null_space, shape_dna};
@@ -9,14 +10,14 @@ use safetensors::tensor::Dtype;
 use std::io;
 use std::path::Path;
 
-/// Energies of the wave kernel signature.
+/// Number of energies of the wave kernel signature.
 const N_ENERGIES: usize = 100;
-/// Columns of the global point signature, where there are as many pairs.
+/// Maximum number of columns of the global point signature.
 const MAX_GPS: usize = 60;
-/// Vertices whose rows are copied and used together: few enough to stay in the cache.
+/// Number of vertices whose rows are copied and used together: few enough to stay in the cache.
 const BATCH: usize = 48;
 
-/// What computing signatures amounted to.
+/// The cost of computing signatures.
 pub(super) struct Signatures {
     /// Bytes of eigenvectors that were read.
     bytes: f64,
@@ -24,7 +25,7 @@ pub(super) struct Signatures {
 }
 
 impl Signatures {
-    /// In words, for the milliseconds that it took.
+    /// The rates as text, for a computation of `ms` milliseconds.
     pub(super) fn rates(&self, ms: f64) -> String {
         let per_second = |x: f64| x / (1e6 * ms.max(1e-6));
         format!(
@@ -35,7 +36,8 @@ impl Signatures {
     }
 }
 
-/// The spectrum at input resolution; what goes to `out` goes there as it is copied out of the solver.
+/// Computes the spectrum at input resolution. Arrays for `out` are written while they are copied
+/// out of the solver.
 pub(super) fn full(task: &Task<'_>) -> Result<Summary, Trouble> {
     let Task {
         mesh: (bytes, format),
@@ -57,7 +59,8 @@ pub(super) fn full(task: &Task<'_>) -> Result<Summary, Trouble> {
             Some(written.map_err(|e| Trouble::Out(path.to_owned(), e))?)
         }
         None => {
-            // As an array in memory, which is what peers return: so that the times of both are of the same.
+            // The eigenvectors become an array in memory, like those of other libraries, so that
+            // the times are comparable.
             laps.enter("spectrum.assemble");
             std::hint::black_box(found.spectrum.all_rows());
             None
@@ -79,8 +82,8 @@ pub(super) fn full(task: &Task<'_>) -> Result<Summary, Trouble> {
     })
 }
 
-/// Writes the file. Rows of eigenvectors are copied a few at a time; while they are in the cache, all
-/// signatures of their vertices are computed, and both are written.
+/// Writes the file. Rows of eigenvectors are copied a few at a time; while they are in the cache,
+/// all signatures of their vertices are computed and written.
 fn write(
     cleaned: &Cleaned,
     found: &MeshSpectrum,

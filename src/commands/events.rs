@@ -1,4 +1,4 @@
-//! `coseg events`: what a collection's log says.
+//! `coseg events` prints the events in a collection's log.
 
 use super::session::Session;
 use super::{CommandError, Outcome, json};

@@ -1,4 +1,4 @@
-//! `coseg export`: labels, or coloured meshes, of a collection become files.
+//! `coseg export` writes labels, or coloured meshes, of a collection to files.
 
 use super::export_mesh::{colour, material, materials};
 use super::session::{Session, bar};
@@ -14,7 +14,7 @@ use coseg::mesh::{ParsedMesh, parse};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// The material file that exported OBJ files name.
+/// The name of the material file in exported OBJ files.
 const MATERIALS: &str = "labels.mtl";
 
 pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
@@ -77,7 +77,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// Name and bytes of a file that holds labels alone; `None` for formats that need the mesh.
+/// Name and bytes of a file that contains only labels; `None` for formats that need the mesh.
 fn without_mesh(
     format: ExportFormat,
     shape: &str,
@@ -105,7 +105,7 @@ fn without_mesh(
     })
 }
 
-/// The axis that is up in the files of a collection: the one it was given, or that most shapes agree on.
+/// The up axis in the files of a collection: the given one, or the one on which most shapes agree.
 fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
     let given = collection.spec.as_ref().map(wire::CollectionSpec::up)?;
     let estimate = collection.up_estimate.as_ref();
@@ -116,7 +116,7 @@ fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
     up_from_wire(up).axis()
 }
 
-/// Name and bytes of a file that holds the mesh, with its up axis, and its labels.
+/// Name and bytes of a file that contains the mesh, with its up axis, and its labels.
 fn with_mesh(
     format: ExportFormat,
     shape: &str,
@@ -155,7 +155,7 @@ fn at(path: &Path, source: std::io::Error) -> CommandError {
     }
 }
 
-/// The mesh of a shape as it was sent.
+/// The mesh of a shape in its original form.
 pub(super) fn original(
     session: &mut Session,
     collection: &str,

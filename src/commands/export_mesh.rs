@@ -1,4 +1,4 @@
-//! What exported meshes show of labels: colours, names of materials.
+//! Provides the colours and the names of the materials of labels in exported meshes.
 
 use coseg::ipc::wire::LabelInfo;
 
@@ -16,7 +16,7 @@ pub(crate) fn colour(label: i32, labels: &[LabelInfo]) -> [u8; 3] {
     })
 }
 
-/// The name of a group and material: the label's id, with the name a person gave.
+/// The name of a group and material: the label's id, followed by its name if it has one.
 pub(crate) fn material(label: i32, labels: &[LabelInfo]) -> String {
     let found = u32::try_from(label)
         .ok()
@@ -29,7 +29,7 @@ pub(crate) fn material(label: i32, labels: &[LabelInfo]) -> String {
     }
 }
 
-/// All labels, and -1 for what has none, with the names and colours of their materials.
+/// All labels, and -1 for unlabelled faces, with the names and colours of their materials.
 pub(crate) fn materials(infos: &[LabelInfo]) -> Vec<(i32, String, [u8; 3])> {
     let ids = infos
         .iter()

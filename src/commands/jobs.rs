@@ -1,5 +1,5 @@
-//! `coseg jobs`, `coseg retry` and `coseg cancel`: what became of what was added, and trying again
-//! or giving up.
+//! `coseg jobs` lists jobs and failures, `coseg retry` queues failed shapes again, and `coseg
+//! cancel` cancels shapes.
 
 use super::session::{Session, table};
 use super::{CommandError, Outcome, interrupt};
@@ -141,9 +141,9 @@ pub(crate) fn cancel(args: &Cancel, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// Jobs with shapes that are not placed yet, the oldest first.
+/// Jobs with shapes that are not yet placed, oldest first.
 fn unfinished(collection: &str, session: &mut Session) -> Result<Vec<u64>, CommandError> {
-    // A misspelt name would find no jobs, and no fault.
+    // A misspelt name would find no jobs, and report no error.
     session.describe(collection)?;
     let (mut found, mut before) = (Vec::new(), 0);
     loop {

@@ -1,4 +1,4 @@
-//! `coseg keys`: makes keys, and says who may connect.
+//! `coseg keys` generates keys and manages the list of clients that may connect.
 
 use super::session::{print_line, table};
 use super::{CommandError, Outcome};
@@ -79,7 +79,7 @@ pub(crate) fn run(args: &Keys, global: &Global) -> Outcome {
     Ok(true)
 }
 
-/// `--dir`, or as the daemon's configuration says, or the user's own.
+/// The folder of keys: `--dir`, or that of the daemon's configuration, or the user's own.
 fn folder(args: &Keys) -> Result<PathBuf, CommandError> {
     if let Some(dir) = &args.dir {
         return Ok(dir.clone());

@@ -1,5 +1,5 @@
-//! A file of labels becomes a label for each face: text with one a line, NumPy, or what `coseg
-//! export` writes.
+//! Reads a label for each face from a file: text with one on each line, NumPy, or a file of `coseg
+//! export`.
 
 use super::CommandError;
 use super::npy::{self, Elements};
@@ -8,7 +8,7 @@ use coseg::library::MAX_LABEL;
 use serde_json::Value;
 use std::path::Path;
 
-/// The labels in a file. What it holds is told by its content.
+/// The labels in a file. The format is recognised by its content.
 pub(crate) fn read(path: &Path) -> Result<Vec<i32>, CommandError> {
     let bytes = std::fs::read(path).map_err(|source| CommandError::File {
         path: path.display().to_string(),
@@ -28,7 +28,7 @@ fn labels_of(bytes: &[u8]) -> Result<Vec<i32>, String> {
     }
 }
 
-/// A number as a label; `place` says where it stands.
+/// Converts a number to a label; `location` describes its position in messages.
 fn label(number: i64, place: impl Fn() -> String) -> Result<i32, String> {
     match i32::try_from(number) {
         Ok(label) if (-1..=i64::from(MAX_LABEL)).contains(&number) => Ok(label),
@@ -39,7 +39,7 @@ fn label(number: i64, place: impl Fn() -> String) -> Result<i32, String> {
     }
 }
 
-/// Blank lines may follow the last label: one between labels is a label that is missing.
+/// Blank lines may follow the last label; a blank line between labels is a missing label.
 fn from_text(text: &str) -> Result<Vec<i32>, String> {
     let labels = text.trim_end().lines().enumerate().map(|(i, line)| {
         let word = line.trim();

@@ -1,4 +1,4 @@
-//! `coseg labels`: a label for each face of a shape's file.
+//! `coseg labels` prints a label for each face of a shape's file.
 
 use super::session::Session;
 use super::{CommandError, Outcome};
@@ -16,7 +16,7 @@ pub(crate) struct Received {
     pub(crate) confidence: Option<Vec<f32>>,
 }
 
-/// Asks for the labels of a shape; version 0 is the newest.
+/// Requests the labels of a shape; version 0 is the newest.
 pub(crate) fn receive(
     session: &mut Session,
     request: wire::GetLabelsRequest,

@@ -1,4 +1,4 @@
-//! `coseg ls`: collections, or the shapes of one.
+//! `coseg ls` lists collections, or the shapes of one.
 
 use super::collections::warn_of_up;
 use super::session::{Session, table};

@@ -1,4 +1,4 @@
-//! `coseg man`: the manual page, made from what `--help` says.
+//! `coseg man` prints the manual page, generated from `--help`.
 
 use super::{CommandError, Outcome};
 use crate::cli::Cli;

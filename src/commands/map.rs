@@ -1,4 +1,4 @@
-//! `coseg map`: the functional map from one shape to another, and which parts it matches.
+//! `coseg map` shows the functional map between two shapes, and the parts that it matches.
 
 use super::render::pair;
 use super::session::{Session, table};
@@ -124,7 +124,7 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// What is asked of a map between points.
+/// The options of a map between points.
 pub(super) fn options(landmarks: &[(u32, u32)], mirrored: bool) -> wire::PointMapOptions {
     let orientation = if mirrored {
         wire::MapOrientation::Reverse
@@ -142,7 +142,7 @@ pub(super) fn options(landmarks: &[(u32, u32)], mirrored: bool) -> wire::PointMa
     }
 }
 
-/// To how much something corresponds, and how much of what labels say is to be believed.
+/// The share with a counterpart, and the expected accuracy of transferred labels.
 pub(super) fn match_line(q: &wire::MapQuality) -> String {
     let mut line = format!(
         "something corresponds to {:.1} % of the second",
@@ -157,7 +157,7 @@ pub(super) fn match_line(q: &wire::MapQuality) -> String {
     line
 }
 
-/// How a map agrees with the others of its collection.
+/// The agreement of a map with the others of its collection.
 fn agreement_line(a: &wire::MapAgreement) -> String {
     let (n, departure) = (a.n_triangles, a.departure);
     match (n, a.inconsistent) {
@@ -172,7 +172,7 @@ fn agreement_line(a: &wire::MapAgreement) -> String {
     }
 }
 
-/// What is known of a map between points besides, and of its alternative.
+/// Further figures of a map between points, and the cost of its alternative.
 fn point_line(q: &wire::MapQuality, alternative: Option<f64>) -> String {
     let orientation = q.orientation();
     let turned = if orientation < 0.0 {
@@ -192,7 +192,7 @@ fn point_line(q: &wire::MapQuality, alternative: Option<f64>) -> String {
     )
 }
 
-/// The elements of a received array; none if it is missing.
+/// The elements of a received array; an empty array if it is missing.
 fn array<T>(
     array: &Option<ArrayRef>,
     frames: &[bytes::Bytes],
@@ -203,7 +203,7 @@ fn array<T>(
     words.iter().map(|w| read(*w)).collect()
 }
 
-/// Writes arrays as they came: frames and safetensors are both little-endian and row-major.
+/// Writes arrays as received: frames and safetensors are both little-endian and row-major.
 fn write_arrays(
     path: &Path,
     arrays: &[(&str, &Option<ArrayRef>)],

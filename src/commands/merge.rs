@@ -1,4 +1,4 @@
-//! `coseg merge` and `coseg split`: two labels become one, one becomes two.
+//! `coseg merge` merges two labels into one; `coseg split` splits one into two.
 
 use super::session::Session;
 use super::{Outcome, json};

@@ -1,7 +1,8 @@
-//! The bytes of a mesh file; a `.gltf` with its buffers in files beside it becomes one binary file.
+//! Reads the bytes of a mesh file; a `.gltf` with its buffers in separate files is packed into one
+//! binary file.
 //!
-//! A buffer is followed only within the folder of the file, by a relative path, and only if positions or
-//! indices are in it. Textures and whatever else the file names stay where they are.
+//! A buffer is read only from the folder of the file, by a relative path, and only if it contains
+//! positions or indices. Textures and other files are not read.
 
 use coseg::mesh::{Format, write};
 use percent_encoding::percent_decode_str;
@@ -11,13 +12,13 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Component, Path};
 
-/// Extensions of views that name buffers themselves.
+/// Extensions whose views name buffers themselves.
 const COMPRESSIONS: [&str; 2] = ["EXT_meshopt_compression", "KHR_meshopt_compression"];
 
-/// What is sent for the file at a path.
+/// The bytes to send for the file at a path.
 ///
 /// # Errors
-/// When it, or a buffer that it needs, cannot be read.
+/// If the file, or a buffer that it needs, cannot be read.
 pub(crate) fn read(path: &Path, format: Format) -> io::Result<Vec<u8>> {
     let bytes = fs::read(path)?;
     if format != Format::Gltf || bytes.starts_with(b"glTF") {
@@ -31,8 +32,8 @@ pub(crate) fn read(path: &Path, format: Format) -> io::Result<Vec<u8>> {
     Ok(packed.unwrap_or(bytes))
 }
 
-/// The file with the buffers of its triangles, as a GLB; `None` if it has them all, or is no JSON, which
-/// its reader will report.
+/// The file with the buffers of its triangles, as a GLB; `None` if it is already complete, or is
+/// not JSON, which its parser will report.
 fn pack(bytes: &[u8], folder: &Path) -> Result<Option<Vec<u8>>, String> {
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     let Ok(mut root) = serde_json::from_slice::<Value>(text) else {
@@ -51,7 +52,7 @@ fn pack(bytes: &[u8], folder: &Path) -> Result<Option<Vec<u8>>, String> {
         return Ok(None);
     }
     let mut binary = Vec::new();
-    // For each buffer its new index, and where it begins there.
+    // For each buffer its new index, and its offset in the new buffer.
     let mut moved = vec![(0, 0); buffers.len()];
     let mut rest = vec![Value::Null];
     for (index, buffer) in buffers.iter().enumerate() {
@@ -87,7 +88,7 @@ fn is_data(uri: &str) -> bool {
     start.is_some_and(|start| start.eq_ignore_ascii_case("data:"))
 }
 
-/// The buffers that positions and indices are in.
+/// The buffers that contain positions and indices.
 fn needed_buffers(root: &Value) -> BTreeSet<usize> {
     let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
     let index = |value: &Value| value.as_u64().and_then(|i| usize::try_from(i).ok());
@@ -112,7 +113,7 @@ fn needed_buffers(root: &Value) -> BTreeSet<usize> {
     buffers.collect()
 }
 
-/// Gives a view, or what stands for one, the new place of its buffer.
+/// Moves a view, or an object that replaces one, to the new position of its buffer.
 fn relocate(view: &mut Value, moved: &[(usize, u64)]) {
     let buffer = view["buffer"]
         .as_u64()
@@ -126,7 +127,7 @@ fn relocate(view: &mut Value, moved: &[(usize, u64)]) {
     }
 }
 
-/// The bytes of a buffer in a file beside the mesh.
+/// The bytes of a buffer in a separate file.
 fn file(index: usize, buffer: &Value, uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
     let fault = |why: &str| format!("buffer {index} is in {uri:?}, {why}");
     let scheme = uri.split_once(':').map_or("", |(scheme, _)| scheme);
@@ -230,7 +231,7 @@ mod tests {
         let mesh = parse(&bytes, Format::Gltf).unwrap();
         assert_eq!(mesh.triangles, [[0, 1, 2], [2, 1, 3]]);
         assert_eq!(mesh.vertices[3], [1.0, 1.0, 0.0]);
-        // What is not needed stays as it is, and need not be there.
+        // Unneeded parts stay unchanged, and may be missing.
         let text = String::from_utf8_lossy(&bytes).into_owned();
         assert!(
             text.contains("nowhere.png") && text.contains("missing.bin"),

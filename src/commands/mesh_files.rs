@@ -1,4 +1,4 @@
-//! Which files `coseg add` sends, and under which names.
+//! Selects the files that `coseg add` sends, and their shape names.
 
 use super::CommandError;
 use coseg::library::check_shape_name;
@@ -7,11 +7,11 @@ use std::collections::{HashMap, HashSet};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-/// Stands in a shape's name for the `/` of its path below the folder that was named.
+/// Replaces the `/` of a path below the named folder in a shape's name.
 const JOIN: &str = "__";
-/// Most entries of subfolders that are looked at only to say what is there.
+/// Maximum number of entries of subfolders that are examined for a note only.
 const MOST_LOOKED_AT: usize = 10_000;
-/// What lies beside meshes and is passed over without a word.
+/// Extensions of files that commonly lie beside meshes and are skipped silently.
 const BESIDE_MESHES: [&str; 19] = [
     "txt", "md", "mtl", "png", "jpg", "jpeg", "bmp", "tga", "json", "csv", "yaml", "yml", "seg",
     "npy", "npz", "html", "bin", "webp", "ktx2",
@@ -25,21 +25,21 @@ pub(super) struct MeshFile {
     pub(super) format: Format,
 }
 
-/// What is to be sent, in order, and what cannot be.
+/// The files to send, in order, and the paths that cannot be sent.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     pub(super) files: Vec<MeshFile>,
-    /// Paths and why.
+    /// Paths with the reasons.
     pub(super) refused: Vec<(PathBuf, String)>,
-    /// Words about what is passed over, which is no failure.
+    /// Notes about skipped entries, which are not failures.
     pub(super) notes: Vec<String>,
 }
 
-/// The files of the paths: as named, those of a folder as people count, with `recursive` also those
-/// of its subfolders.
+/// Finds the files to send: named files as they are, and those of a folder in natural order; with
+/// `recursive` also those of its subfolders.
 ///
-/// A shape is named by its file's stem; with `recursive` by its path below the folder, `__` for
-/// each `/`. Of two files of one name the first is sent.
+/// A shape takes the name of its file without the extension; with `recursive` that of its path
+/// below the folder, with `__` for each `/`. Of two files of one name the first is sent.
 pub(super) fn find(paths: &[PathBuf], recursive: bool) -> Result<Found, CommandError> {
     let mut search = Search {
         found: Found::default(),
@@ -93,12 +93,12 @@ impl Found {
 struct Search {
     found: Found,
     recursive: bool,
-    /// Folders by device and inode: links may lead in circles.
+    /// Folders by device and inode: links may form cycles.
     entered: HashSet<(u64, u64)>,
 }
 
 impl Search {
-    /// A folder that was typed: it must have something to send.
+    /// Enters a named folder, which must have files to send.
     fn named_folder(&mut self, path: &Path) -> Result<(), CommandError> {
         let before = self.found.files.len() + self.found.refused.len();
         self.folder(path, &mut Vec::new())?;
@@ -145,14 +145,14 @@ impl Search {
                 entries.push((name, entry.path()));
             }
         }
-        // By bytes first: natural order alone does not tell `a01` from `a1`.
+        // Sorted by bytes first, since natural order alone does not distinguish `a01` from `a1`.
         entries.sort();
         entries.sort_by(|a, b| natord::compare(&a.0, &b.0));
         for (name, path) in entries {
             if path.is_dir() {
                 if self.recursive {
                     within.push(name);
-                    // The rest is worth adding where one folder cannot be read.
+                    // One unreadable folder does not keep the others from being added.
                     if let Err(e) = self.folder(&path, within) {
                         self.found.refused.push((path, e.to_string()));
                     }
@@ -170,8 +170,8 @@ impl Search {
         Ok(())
     }
 
-    /// A file whose extension says that it is a mesh, in these folders below the one that was
-    /// named.
+    /// Adds a file whose extension marks it as a mesh; `within` are its folders below the named
+    /// one.
     fn file(&mut self, path: &Path, within: &[String]) {
         let name = path.file_name().unwrap_or_default();
         let format = Format::from_name(&name.to_string_lossy());
@@ -194,7 +194,7 @@ impl Search {
     }
 }
 
-/// A path on one line, whatever is in its name.
+/// A path on one line, whatever characters its name has.
 pub(super) fn printable(path: &Path) -> String {
     let text = path.to_string_lossy();
     text.chars()
@@ -205,7 +205,7 @@ pub(super) fn printable(path: &Path) -> String {
         .collect()
 }
 
-/// Some mesh file in a subfolder, if there is one among the first entries.
+/// A mesh file in a subfolder, if there is one among the first entries.
 fn a_mesh_below(path: &Path) -> Option<PathBuf> {
     let mut folders = vec![path.to_owned()];
     let mut n = 0;
@@ -220,7 +220,7 @@ fn a_mesh_below(path: &Path) -> Option<PathBuf> {
             if name.starts_with('.') {
                 continue;
             }
-            // Links are not followed: this is only for a word.
+            // Links are not followed, since the result serves a note only.
             if kind.is_ok_and(|k| k.is_dir()) {
                 folders.push(entry.path());
             } else if folder != path && Format::from_name(&name).is_some() {

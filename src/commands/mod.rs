@@ -1,4 +1,4 @@
-//! What each subcommand does: one file each.
+//! Implements the subcommands, one file for each.
 
 mod add;
 mod check;
@@ -57,13 +57,13 @@ use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
 
-/// Why a command did not do what was asked.
+/// The reasons why a command failed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum CommandError {
     /// The daemon did not answer, or refused.
     #[error(transparent)]
     Client(#[from] ClientError),
-    /// Keys cannot be used.
+    /// Keys are unusable.
     #[error(transparent)]
     Keys(#[from] KeyError),
     /// The configuration is wrong.
@@ -78,30 +78,30 @@ pub(crate) enum CommandError {
     /// Logging cannot be set up.
     #[error(transparent)]
     Telemetry(#[from] crate::telemetry::TelemetryError),
-    /// Shapes could not be made.
+    /// Shapes could not be generated.
     #[error(transparent)]
     Synth(#[from] synth::SynthError),
-    /// What was typed cannot be meant.
+    /// The arguments are invalid.
     #[error("{0}")]
     Usage(String),
-    /// Something did not work.
+    /// The command failed.
     #[error("{0}")]
     Failed(String),
     /// A file could not be read or written.
     #[error("{path}: {source}")]
     File {
-        /// Which one.
+        /// The file.
         path: String,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// Nobody reads the output any more.
+    /// The reader of stdout has closed it.
     #[error("stdout: {0}")]
     Output(std::io::Error),
 }
 
 impl CommandError {
-    /// As documented in `coseg --help`.
+    /// The exit code, as documented in `coseg --help`.
     pub(crate) fn exit_code(&self) -> ExitCode {
         let code = match self {
             Self::Client(ClientError::NoAnswer { .. }) => exit::NO_ANSWER,
@@ -123,7 +123,7 @@ impl CommandError {
         ExitCode::from(code)
     }
 
-    /// What to do next, where that is not plain from the message.
+    /// The next step for the user, unless the message already implies it.
     pub(crate) fn advice(&self) -> Option<&'static str> {
         let refusal = match self {
             Self::Client(ClientError::NoAnswer { .. }) => {
@@ -148,7 +148,7 @@ impl CommandError {
         })
     }
 
-    /// Whether there is nothing to say about it.
+    /// Whether no message should be printed.
     pub(crate) fn is_silent(&self) -> bool {
         matches!(self, Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe)
     }
@@ -160,10 +160,10 @@ impl From<EndpointError> for CommandError {
     }
 }
 
-/// Whether all that was asked for was done; words about the rest were printed.
+/// Whether the command succeeded for all its items; messages about the others were printed.
 pub(crate) type Outcome = Result<bool, CommandError>;
 
-/// Carries out one command.
+/// Runs one command.
 pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
     let session = || Session::open(&cli.global);
     let done = match &cli.command {

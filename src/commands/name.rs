@@ -1,4 +1,4 @@
-//! `coseg name`: a label gets a name.
+//! `coseg name` gives a label a name.
 
 use super::session::Session;
 use super::{Outcome, json};

@@ -1,4 +1,4 @@
-//! `coseg nearest`: the shapes most like one shape.
+//! `coseg nearest` lists the shapes most similar to one shape.
 
 use super::Outcome;
 use super::session::{Session, table};

@@ -1,14 +1,14 @@
-//! NumPy files, read and written: versions 1 to 3, integers and floats in either byte order.
+//! Reads and writes NumPy files: versions 1 to 3, integers and floats in either byte order.
 
-/// Where every NumPy file begins.
+/// The first bytes of every NumPy file.
 pub(crate) const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// The elements of an array, rows first.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Elements {
-    /// Of any integer type.
+    /// Elements of any integer type.
     Integers(Vec<i64>),
-    /// Of four or eight bytes.
+    /// Elements of four or eight bytes.
     Floats(Vec<f64>),
 }
 
@@ -20,7 +20,7 @@ pub(crate) struct Array {
     pub(crate) n_columns: Option<usize>,
 }
 
-/// The array in a file, or what is wrong with it.
+/// Parses the array in a file; the error describes the fault.
 pub(crate) fn read(bytes: &[u8]) -> Result<Array, String> {
     let short = || "the file ends within its heading".to_owned();
     let major = *bytes.get(6).ok_or_else(short)?;
@@ -67,7 +67,7 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Array, String> {
     })
 }
 
-/// The elements of a kind such as `<i4`, of which there must be `count`.
+/// Parses elements of a kind such as `<i4`, of which there must be `count`.
 fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, String> {
     let unknown = || format!("elements of kind {kind:?}, but integers, <f4 and <f8 are read");
     let (&order, what) = kind.as_bytes().split_first().ok_or_else(unknown)?;
@@ -83,7 +83,7 @@ fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, S
             "{n} bytes of data, which is not what its heading says"
         ));
     }
-    // Eight bytes, the lowest first, extended by `fill`.
+    // Converts an element to eight bytes, lowest first, extended by `fill`.
     let word = |element: &[u8], fill: fn(u8) -> u8| -> [u8; 8] {
         let byte = |i: usize| if order == b'>' { size - 1 - i } else { i };
         let high = fill(element[byte(size - 1)]);
@@ -118,7 +118,7 @@ fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, S
     }
 }
 
-/// The file of an array of floats with rows of `dim`; one axis if that is 1.
+/// Formats an array of floats with rows of `dim` as a file; it has one axis if `dim` is 1.
 pub(crate) fn floats(values: &[f32], dim: usize) -> Vec<u8> {
     let n = values.len() / dim.max(1);
     let shape = match dim {

@@ -1,4 +1,4 @@
-//! `coseg rm`: shapes leave a collection.
+//! `coseg rm` removes shapes from a collection.
 
 use super::confirm::confirmed;
 use super::session::Session;
@@ -10,7 +10,7 @@ use coseg::ipc::wire;
 use coseg::library::shown;
 use serde_json::json;
 
-/// Shapes that a question names; of more it says how many.
+/// Maximum number of shapes that the question names; it counts the others.
 const NAMED: usize = 5;
 
 pub(crate) fn run(args: &Rm, mut session: Session) -> Outcome {

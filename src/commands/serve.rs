@@ -1,4 +1,4 @@
-//! `coseg serve`: the configuration becomes a running daemon.
+//! `coseg serve` starts a daemon with the configuration.
 
 use super::Outcome;
 use crate::cli::{Global, Serve};

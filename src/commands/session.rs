@@ -1,4 +1,4 @@
-//! A client with what every command needs: which collection is meant, waiting, printing.
+//! Provides the functions that commands share: selecting the collection, waiting, printing.
 
 use super::{CommandError, interrupt};
 use crate::cli::{Global, InCollection, OneCollection};
@@ -14,17 +14,17 @@ use serde_json::Value;
 use std::io::{IsTerminal as _, Write as _};
 use std::time::Duration;
 
-/// Longest single wait in the daemon: an answer comes at least this often, well within the timeout.
+/// Longest single wait in the daemon, so that an answer arrives well within the timeout.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
 
-/// A connection to the daemon and how to print.
+/// A connection to the daemon, and the form of output.
 pub(crate) struct Session {
     pub(crate) client: Client,
     pub(crate) json: bool,
 }
 
 impl Session {
-    /// For the endpoint that was named, or the default one.
+    /// Opens a connection to the named endpoint, or to the default one.
     pub(crate) fn open(global: &Global) -> Result<Self, CommandError> {
         let uri = match &global.endpoint {
             Some(uri) => uri.clone(),
@@ -55,7 +55,8 @@ impl Session {
         u64::try_from(wait.as_millis()).unwrap_or(u64::MAX)
     }
 
-    /// A job once it has changed after `revision`, which becomes that of the answer, or when some time has passed.
+    /// Returns a job once it has changed after `revision`, or after some time; `revision` becomes
+    /// that of the answer.
     pub(crate) fn watch_job(
         &mut self,
         job_id: u64,
@@ -73,7 +74,7 @@ impl Session {
         Ok(job)
     }
 
-    /// The collection that was named, or the only one there is.
+    /// The named collection, or the only one that exists.
     pub(crate) fn collection(&mut self, within: &InCollection) -> Result<String, CommandError> {
         if let Some(name) = &within.collection {
             return Ok(name.clone());
@@ -105,7 +106,7 @@ impl Session {
             .collect())
     }
 
-    /// The id of the label that was typed: an id, or the name of a label in use.
+    /// The id of a label on the command line: an id, or the name of a label in use.
     pub(crate) fn label(&mut self, collection: &str, typed: &str) -> Result<u32, CommandError> {
         if !typed.is_empty() && typed.bytes().all(|b| b.is_ascii_digit()) {
             let id = typed.parse();
@@ -129,7 +130,7 @@ impl Session {
         Ok(reply.collection.unwrap_or_default())
     }
 
-    /// All shapes of a collection, or those that carry `label`.
+    /// All shapes of a collection, or those that have `label`.
     pub(crate) fn shapes(
         &mut self,
         collection: &str,
@@ -154,7 +155,7 @@ impl Session {
         }
     }
 
-    /// The collection that is named, or the only one; idle, unless that is not to be waited for.
+    /// The named collection, or the only one; waits until it is idle unless `no_wait`.
     pub(crate) fn settled_collection(
         &mut self,
         of: &OneCollection,
@@ -167,7 +168,7 @@ impl Session {
         Ok(collection)
     }
 
-    /// Waits until the collection has nothing left to do, for as long as the daemon answers.
+    /// Waits until the collection has no work left, as long as the daemon answers.
     pub(crate) fn wait_until_idle(&mut self, collection: &str) -> Result<(), CommandError> {
         let mut bar = None;
         loop {
@@ -200,7 +201,7 @@ impl Session {
         print_line(&shown(text))
     }
 
-    /// Prints JSON, the only thing on stdout.
+    /// Prints JSON, the only output on stdout.
     pub(crate) fn print_json(&self, value: &Value) -> Result<(), CommandError> {
         print_line(&value.to_string())
     }
@@ -214,7 +215,7 @@ pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
         .map_err(CommandError::Output)
 }
 
-/// The label that has this name; one that was merged into another is out of use.
+/// The label with this name; a label that was merged into another is out of use.
 fn label_named(name: &str, labels: &[wire::LabelInfo]) -> Result<u32, String> {
     let in_use = || labels.iter().filter(|l| l.merged_into.is_none());
     let has_it = |l: &&wire::LabelInfo| !name.is_empty() && l.name == name;
@@ -237,7 +238,7 @@ fn label_named(name: &str, labels: &[wire::LabelInfo]) -> Result<u32, String> {
     }
 }
 
-/// Several collections could be meant.
+/// The error if several collections are possible.
 pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     let names = names.join(", ");
     let names = shown(&names);
@@ -246,7 +247,7 @@ pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     ))
 }
 
-/// Columns padded to the widest entry; the first row is the heading.
+/// Pads columns to the widest entry; the first row is the heading.
 pub(crate) fn table(rows: &[Vec<String>]) -> String {
     let shown_row = |row: &Vec<String>| row.iter().map(|c| shown(c).into_owned()).collect();
     let rows: Vec<Vec<String>> = rows.iter().map(shown_row).collect();
@@ -268,7 +269,7 @@ pub(crate) fn table(rows: &[Vec<String>]) -> String {
     lines.collect::<Vec<_>>().join("\n")
 }
 
-/// A progress bar on stderr if that is a terminal, else one that draws nothing.
+/// A progress bar on stderr if stderr is a terminal, else one that draws nothing.
 pub(crate) fn bar(length: u64) -> ProgressBar {
     if !std::io::stderr().is_terminal() {
         return ProgressBar::hidden();

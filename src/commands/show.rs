@@ -1,4 +1,5 @@
-//! `coseg show`: one shape with its parts and sources, or one collection with its labels.
+//! `coseg show` prints one shape with its parts and the sources of its labels, or one collection
+//! with its labels.
 
 use super::collections::warn_of_up;
 use super::session::{Session, table};
@@ -77,7 +78,7 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     Ok(true)
 }
 
-/// What cleaning found and did, in words.
+/// The findings and actions of cleaning as text.
 pub(super) fn found(r: &wire::CleanReport) -> String {
     let inner = format!(
         "inner walls left to those around them ({} triangles)",

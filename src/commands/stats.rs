@@ -1,4 +1,4 @@
-//! `coseg stats`: counters of the daemon.
+//! `coseg stats` prints the counters of the daemon.
 
 use super::Outcome;
 use super::session::{Session, table};
@@ -48,7 +48,7 @@ pub(crate) fn run(mut session: Session) -> Outcome {
         session.print_json(&value)?;
         return Ok(true);
     }
-    // `coseg top` shows stages.
+    // `coseg top` shows the stages.
     let entries = value.as_object().into_iter().flatten();
     let entries = entries.filter(|(_, value)| !value.is_array());
     let rows = entries.map(|(key, value)| {

@@ -1,4 +1,4 @@
-//! `coseg stop`: the daemon finishes what it is at and ends.
+//! `coseg stop` lets the daemon finish its current work and end.
 
 use super::session::Session;
 use super::{CommandError, Outcome, interrupt};
@@ -11,15 +11,16 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
-/// Jobs, the newest, among which shapes in work are looked for.
+/// Number of jobs, the newest, that are searched for running shapes.
 const JOBS_LOOKED_AT: u32 = 50;
-/// Between looks at whether anybody listens any more. The kernel has no event for that.
+/// Interval between tests whether the endpoint still has a listener; the kernel has no event for
+/// that.
 const LOOK: Duration = Duration::from_millis(50);
-/// A daemon drains for at most half of this.
+/// Time limit for the end of the daemon, which drains for at most half of it.
 const LONGEST_WAIT: Duration = Duration::from_secs(60);
 
 pub(crate) fn run(args: &Stop, mut session: Session) -> Outcome {
-    // For words only: what cannot be listed can be stopped all the same.
+    // The list only serves the message, so the daemon is stopped even if it cannot be obtained.
     let in_work = in_work(&mut session).unwrap_or_default();
     let reply = call!(session.client, Drain(wire::DrainRequest {}))?;
     if !session.json {
@@ -65,7 +66,7 @@ fn what_is_waited_for(in_work: &[String], n_queued: u64) -> String {
     }
 }
 
-/// Waits until nobody listens at the endpoint any more; not for ever, since a supervisor may have
+/// Waits until the endpoint has no listener. There is a time limit, since a supervisor may have
 /// started another daemon.
 fn wait_until_gone(endpoint: &Endpoint) -> Result<(), CommandError> {
     let begin = Instant::now();

@@ -1,4 +1,4 @@
-//! `coseg suggest`: the shape that is worth a person's minute.
+//! `coseg suggest` names the shape that is most worth labelling by hand.
 
 use super::Outcome;
 use super::session::Session;

@@ -1,4 +1,4 @@
-//! A family and a seed become a folder of labelled meshes.
+//! `coseg synth` generates a folder of labelled meshes from a family and a seed.
 
 use clap::Args;
 use coseg::mesh::write::off;
@@ -9,22 +9,22 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Most faces a shape may be asked for.
+/// Maximum number of faces of a shape.
 const MOST_FACES: i64 = 1_000_000;
 
-/// `coseg synth`: write a family of labelled shapes.
+/// `coseg synth`: generates a family of labelled shapes.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct SynthArgs {
-    /// Which family; `--list` shows them.
+    /// The family; `--list` lists all.
     #[arg(required_unless_present = "list", value_parser = parse_family)]
     pub(crate) family: Option<Family>,
-    /// How many shapes.
+    /// Number of shapes.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) count: u32,
     /// The same seed gives the same files on every machine.
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
-    /// Faces of each shape.
+    /// Number of faces of each shape.
     #[arg(
         long,
         default_value_t = 6_000,
@@ -34,7 +34,7 @@ pub(crate) struct SynthArgs {
     /// Turn each shape at random; otherwise +y is up and all face the same way.
     #[arg(long)]
     pub(crate) rotate: bool,
-    /// Where NAME.off, NAME.labels.txt and LABEL_NAMES.txt go; created if missing.
+    /// Folder for NAME.off, NAME.labels.txt and LABEL_NAMES.txt; created if missing.
     #[arg(long, required_unless_present = "list")]
     pub(crate) out: Option<PathBuf>,
     /// List the families and their parts.
@@ -42,7 +42,7 @@ pub(crate) struct SynthArgs {
     pub(crate) list: bool,
 }
 
-/// Why the shapes could not be written.
+/// The reasons why the shapes could not be written.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum SynthError {
     /// Both a family and a folder are needed.
@@ -51,9 +51,9 @@ pub(crate) enum SynthError {
     /// A file or the folder could not be written.
     #[error("cannot write {path}: {source}")]
     Write {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
     /// The report could not be printed.
@@ -65,7 +65,7 @@ fn parse_family(name: &str) -> Result<Family, UnknownFamily> {
     name.parse()
 }
 
-/// Writes the shapes, or lists the families, and prints what was done.
+/// Writes the shapes or lists the families, and prints a report.
 pub(crate) fn run(args: &SynthArgs, json: bool) -> Result<(), SynthError> {
     let text = if args.list {
         list(json)

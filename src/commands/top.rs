@@ -1,4 +1,4 @@
-//! `coseg top`: queue, rates and stages of the daemon, drawn anew as they change.
+//! `coseg top` displays queue, rates and stages of the daemon, and refreshes them periodically.
 
 use super::session::{Session, print_line, table};
 use super::{Outcome, stats};
@@ -9,9 +9,9 @@ use std::fmt::Write as _;
 use std::io::IsTerminal as _;
 use std::time::Instant;
 
-/// Clears the screen and goes to its upper left corner.
+/// Clears the screen and moves to its upper left corner.
 const CLEAR: &str = "\x1b[H\x1b[2J";
-/// Characters of a bar of a stage.
+/// Length of the bar of a stage in characters.
 const BAR: usize = 24;
 
 pub(crate) fn run(args: &Top, mut session: Session) -> Outcome {
@@ -24,7 +24,7 @@ pub(crate) fn run(args: &Top, mut session: Session) -> Outcome {
         if session.json {
             session.print_json(&stats::json(&now))?;
         } else {
-            // Counters of another daemon say nothing of this one.
+            // Counters of another daemon cannot be compared with those of this one.
             let before = before.as_ref().filter(|b| b.1.instance == now.instance);
             let since = before.map(|(then, stats)| (at.duration_since(*then).as_secs_f64(), stats));
             let text = picture(&now, since);
@@ -43,7 +43,7 @@ pub(crate) fn run(args: &Top, mut session: Session) -> Outcome {
     }
 }
 
-/// What is shown; with the seconds since an earlier look and what was seen then, rates as well.
+/// The text of the display; it contains rates if an earlier reply is given, with the seconds since.
 fn picture(now: &StatsReply, before: Option<(f64, &StatsReply)>) -> String {
     let rate = |of: fn(&StatsReply) -> u64| match before {
         Some((secs, then)) if secs > 0.0 => of(now).saturating_sub(of(then)) as f64 / secs,

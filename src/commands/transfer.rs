@@ -1,4 +1,4 @@
-//! `coseg transfer`: labels or functions at the faces of one shape, carried to those of another.
+//! `coseg transfer` transfers labels or functions at the faces of one shape to another.
 
 use super::session::{Session, print_line};
 use super::{CommandError, Outcome, map, values};

@@ -1,4 +1,4 @@
-//! `coseg undo`: the newest change by a person is taken back.
+//! `coseg undo` undoes the newest change by a person.
 
 use super::Outcome;
 use super::session::Session;

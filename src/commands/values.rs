@@ -1,4 +1,5 @@
-//! Values at the faces of a shape are read from and written to files: NumPy arrays, or text with a row a face.
+//! Reads and writes values at the faces of a shape: NumPy arrays, or text with one row for each
+//! face.
 
 use super::CommandError;
 use super::npy::{self, Array, Elements};
@@ -19,14 +20,14 @@ pub(crate) fn read(path: &Path) -> Result<PolygonValues, CommandError> {
     parsed.map_err(|e| CommandError::Failed(format!("{}: {e}", path.display())))
 }
 
-/// A text in any Unicode encoding, its lines ended by LF alone.
+/// Decodes text in any Unicode encoding, with lines ended by LF alone.
 pub(super) fn lines(bytes: &[u8]) -> String {
     let text = as_utf8(bytes);
     let text = String::from_utf8_lossy(&text);
     text.replace("\r\n", "\n").replace('\r', "\n")
 }
 
-/// The values as the bytes of a file: NumPy if its name ends so, else text.
+/// Formats the values as a file: NumPy if its name ends in .npy, else text.
 pub(crate) fn bytes(path: &Path, values: &PolygonValues) -> Vec<u8> {
     match path.extension().is_some_and(|e| e == "npy") {
         true => to_npy(values),
@@ -34,7 +35,7 @@ pub(crate) fn bytes(path: &Path, values: &PolygonValues) -> Vec<u8> {
     }
 }
 
-/// The values as text, a row a line.
+/// Formats the values as text, one row on each line.
 pub(crate) fn text(values: &PolygonValues) -> String {
     match values {
         PolygonValues::Labels(labels) => labels.iter().map(|l| format!("{l}\n")).collect(),

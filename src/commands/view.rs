@@ -1,4 +1,4 @@
-//! `coseg view`: a collection becomes one HTML file, the viewer with everything inside.
+//! `coseg view` writes a collection as one HTML file that contains the viewer and all its data.
 
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, events, json};
@@ -10,11 +10,11 @@ use coseg::ipc::wire;
 use coseg::viewer::{Embedded, portrait};
 use serde_json::{Map, Value, json};
 
-/// Shapes of one pack: the first one is on the screen before the others are read.
+/// Number of shapes of one pack: the first pack is on the screen before the others are read.
 const BATCH: usize = 25;
-/// Neighbours of each shape.
+/// Number of neighbours of each shape.
 const N_NEIGHBORS: u32 = 6;
-/// Maps of each shape: from those that its labels were carried from, or that are nearest.
+/// Number of maps of each shape: from the sources of its labels, or from its nearest shapes.
 const N_MAPS: usize = 2;
 
 pub(crate) fn run(args: &View, mut session: Session) -> Outcome {
@@ -139,7 +139,8 @@ fn nearest(
     Ok(call!(session.client, Nearest(request))?.neighbors)
 }
 
-/// Shapes of the file from which maps to `shape` are worth showing; those that labels came along are kept already.
+/// Shapes of the file whose maps to `shape` are shown; maps of label sources come first, since they
+/// are stored.
 fn mapped_from(shape: &wire::Shape, near: &[wire::Neighbor], names: &[String]) -> Vec<String> {
     let sources = shape.sources.iter().map(|s| &s.shape);
     let mut from: Vec<String> = Vec::new();

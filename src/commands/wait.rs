@@ -1,4 +1,4 @@
-//! `coseg wait`: until a collection has nothing left to do.
+//! `coseg wait` waits until a collection has no work left.
 
 use super::Outcome;
 use super::session::Session;

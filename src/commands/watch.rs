@@ -1,7 +1,7 @@
-//! `coseg watch`: events as they happen, none left out.
+//! `coseg watch` prints all events as they happen.
 //!
-//! The event socket may drop events for a slow reader. A gap in the numbers, also one that only a
-//! heartbeat shows, is filled from the log.
+//! The event socket may drop events for a slow reader. A gap in the sequence numbers, also one that
+//! only a heartbeat shows, is filled from the log.
 
 use super::session::Session;
 use super::{CommandError, Outcome, events, json};
@@ -14,7 +14,7 @@ use prost::Message as _;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// Heartbeats come once a second; this many may be late.
+/// Longest silence that is accepted: heartbeats come once a second, and a few may be late.
 const LEAST_SILENCE: Duration = Duration::from_secs(3);
 
 /// Prints events in order and counts them.
@@ -48,7 +48,7 @@ impl Printer {
         Ok(())
     }
 
-    /// Prints all up to `sequence`, which the event socket announced.
+    /// Prints all events up to `sequence`, which the event socket announced.
     fn catch_up(
         &mut self,
         collection: &str,
@@ -80,7 +80,7 @@ pub(crate) fn run(args: &Watch, mut session: Session) -> Outcome {
     };
     let ms = i32::try_from(silence.as_millis()).unwrap_or(i32::MAX);
     socket.set_rcvtimeo(ms).map_err(socket_error)?;
-    // After subscribing, so that nothing falls between.
+    // The log is read after subscribing, so that no event is lost in between.
     let mut printer = Printer {
         seen: BTreeMap::new(),
         only: only.clone(),

@@ -1,5 +1,5 @@
-//! How fast the kernels of the geometry are: `cargo bench -p coseg-geometry`, with a word after
-//! `--` for those whose names contain it. One thread; the meshes are made here.
+//! Times the kernels of the geometry: `cargo bench -p coseg-geometry`, with a word after `--` to
+//! run only those whose names contain it. One thread; the meshes are generated here.
 
 use coseg_geometry::SpectralMesh;
 use coseg_geometry::descriptors::{FaceDescriptors, face_descriptors, face_kernels};

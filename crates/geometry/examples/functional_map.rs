@@ -1,5 +1,5 @@
-//! A functional map between two meshes: `functional_map [ONE TWO]`; without files, between a lumpy
-//! sphere and the same one turned and stretched.
+//! Computes a functional map between two meshes: `functional_map [ONE TWO]`; without files, between
+//! a lumpy sphere and the same one turned and stretched.
 
 use coseg_geometry::fmap::{EstimateOptions, point_maps};
 use coseg_geometry::mesh::{self, Format, TriMesh};

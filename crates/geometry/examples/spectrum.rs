@@ -1,4 +1,4 @@
-//! The smallest eigenvalues of a mesh: `spectrum [FILE [K]]`; without a file, of a sphere.
+//! Computes the smallest eigenvalues of a mesh: `spectrum [FILE [K]]`; without a file, of a sphere.
 
 use coseg_geometry::mesh::{self, Format, TriMesh};
 use coseg_geometry::{SpectralMesh, operators::Operator, spectrum::Options};

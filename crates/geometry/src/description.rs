@@ -1,19 +1,19 @@
-//! Everything that is computed from one shape alone.
+//! The [`Description`] of a shape: all results that are computed from one shape alone.
 
 use crate::mesh::{CleanReport, TriMesh};
 use crate::operators::Operator;
 
-/// What `describe` depends on besides the bytes.
+/// The parameters of `describe`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Params {
-    /// Which Laplacian.
+    /// The discrete Laplacian.
     pub operator: Operator,
     /// Faces of the working-resolution proxy.
     pub working_faces: u32,
-    /// Eigenpairs asked for.
+    /// Number of eigenpairs to compute.
     pub n_eigenpairs: u32,
-    /// Whether a mesh may have fewer: at most a quarter of its vertices, beyond which eigenvalues say more of the
-    /// triangles than of the surface.
+    /// Whether a mesh may have fewer eigenpairs: at most a quarter of its vertices. Eigenvalues
+    /// beyond that describe the triangles rather than the surface.
     pub only_meaningful: bool,
     /// Threads for the spectrum; the result does not depend on it.
     pub threads: u32,
@@ -31,13 +31,13 @@ impl Default for Params {
     }
 }
 
-/// The description of one shape. All arrays are row-major and hold exactly what is stored, so a
-/// description fresh from `describe` and one read back from its file are the same bits.
+/// The description of one shape. All arrays are row-major and equal the stored arrays bit by bit,
+/// whether the description comes from `describe` or from its file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Description {
     /// Surface area in squared input units. All other lengths below are scaled to area 1.
     pub area: f64,
-    /// What cleaning found and did.
+    /// The defects that cleaning found and repaired.
     pub report: CleanReport,
     /// Proxy vertices `(n, 3)`, centred, total area 1, in the input's orientation.
     pub vertices: Vec<[f32; 3]>,

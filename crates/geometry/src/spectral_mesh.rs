@@ -1,6 +1,6 @@
-//! A triangle mesh becomes a mesh of area 1 with its Laplacian and spectrum, at full resolution.
+//! Computes the Laplacian and the spectrum of a triangle mesh scaled to area 1, at full resolution.
 //!
-//! This is what a functional map between two meshes needs of each; [`crate::fmap::point_maps`] makes
+//! A functional map between two meshes needs these of each; [`crate::fmap::point_maps`] computes
 //! the map.
 
 use crate::fmap::{Basis, EstimateOptions, PointShape};
@@ -19,7 +19,7 @@ pub struct SpectralMesh {
     pub laplacian: Laplacian,
     /// Eigenvalues `(k,)` and mass-orthonormal eigenvectors `(n, k)`, with the certificate.
     pub spectrum: Spectrum,
-    // As functional maps use them: row-major, in single precision.
+    // In the layout of functional maps: row-major, in single precision.
     vertices: Vec<[f32; 3]>,
     eigenvectors: Vec<f32>,
     mass: Vec<f32>,
@@ -41,7 +41,7 @@ impl SpectralMesh {
     /// Scales `mesh` to area 1 and computes the `k` smallest eigenpairs of its Laplacian
     /// (all of them if it has fewer vertices than `k`). The cost is about `n k²`.
     ///
-    /// The mesh keeps its vertices; [`crate::mesh::clean`] mends meshes that need it first.
+    /// The mesh keeps its vertices; use [`crate::mesh::clean`] first if it may have defects.
     ///
     /// ```
     /// use coseg_geometry::mesh::icosphere;
@@ -58,7 +58,7 @@ impl SpectralMesh {
     /// ```
     ///
     /// # Errors
-    /// A mesh without area, or one whose spectrum cannot be proved complete.
+    /// If the mesh has no area, or its spectrum cannot be proved complete.
     pub fn new(
         mut mesh: TriMesh,
         operator: Operator,
@@ -94,7 +94,7 @@ impl SpectralMesh {
         })
     }
 
-    /// What all maps from or to this mesh share: samples, probe functions and the sense of
+    /// The data that all maps from or to this mesh share: samples, probe functions and the
     /// orientation.
     ///
     /// ```
@@ -126,7 +126,8 @@ impl SpectralMesh {
         PointShape::new(&self.vertices, &self.mesh.faces, self.basis(), options)
     }
 
-    /// The spectrum as functional maps take it: row-major, in single precision, total mass 1.
+    /// The spectrum in the form that functional maps take: row-major, in single precision, total
+    /// mass 1.
     ///
     /// ```
     /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};

@@ -1,13 +1,15 @@
-//! Stiffness W and lumped mass A become the smallest eigenpairs of `W φ = λ A φ`, proved complete.
+//! Computes the smallest eigenpairs of `W φ = λ A φ` for stiffness W and lumped mass A, and proves
+//! that none is missing.
 //!
-//! W is split into connected components and standardised, `S = A^{-1/2} W A^{-1/2}`. On each, block
-//! Lanczos runs on `(S - σI)⁻¹` with σ inside the wanted part of the spectrum, where the sparse
-//! L D Lᵀ factor of `S - σI` also counts the eigenvalues below σ. A second factorisation at τ, in
-//! the gap above the last wanted eigenvalue, must have exactly as many negative pivots as pairs were
-//! found below τ (Sylvester's law of inertia; Grimes, Lewis and Simon 1994): nothing is missing.
-//! Small components, or most of a spectrum, are solved densely. Residuals are measured on W itself;
-//! where an unpivoted indefinite factor was not accurate enough, inverse iteration with a definite
-//! one and a Rayleigh–Ritz step follow.
+//! W is split into connected components and standardised, `S = A^{-1/2} W A^{-1/2}`. On each
+//! component, block Lanczos runs on `(S - σI)⁻¹` with σ inside the wanted part of the spectrum,
+//! where the sparse L D Lᵀ factor of `S - σI` also counts the eigenvalues below σ. A second
+//! factorisation at τ, in the gap above the last wanted eigenvalue, must have exactly as many
+//! negative pivots as there are pairs below τ (Sylvester's law of inertia; Grimes, Lewis and Simon
+//! 1994), so that none is missing. Small components are solved densely, and so are components of
+//! which most of the spectrum is wanted. Residuals are measured on W itself. Where an unpivoted
+//! indefinite factor was not accurate enough, inverse iteration with a definite one and a
+//! Rayleigh–Ritz step follow.
 
 mod component;
 mod connected;
@@ -23,7 +25,7 @@ use component::{Component, components, validate};
 use connected::{Pairs, Setting, smallest};
 use nalgebra::DMatrix;
 
-/// Where a solve is.
+/// The progress of a solve.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Progress {
     /// `components`, `factor`, `iterate`, `check`, `certify`, `vectors`, `repair`, `verify`,
@@ -31,7 +33,7 @@ pub struct Progress {
     pub stage: &'static str,
     /// Vectors of the Krylov space, in stages `iterate` and `repair`; 0 in others.
     pub done: usize,
-    /// How many it is to have, as far as is known; never less than `done`. 0 in other stages.
+    /// Expected number of vectors, as far as known; never less than `done`. 0 in other stages.
     pub expected: usize,
 }
 
@@ -48,7 +50,7 @@ pub struct Options<'a> {
     pub tolerance: f64,
     /// 1: the calling thread alone. More: the rayon pool of the caller. Same bits either way.
     pub threads: usize,
-    /// Told of each stage and block, and asked whether to go on.
+    /// Called at each stage and block; decides whether to continue.
     pub progress: Option<ProgressHook<'a>>,
 }
 
@@ -74,7 +76,7 @@ impl std::fmt::Debug for Options<'_> {
     }
 }
 
-/// What proves that no eigenvalue is missing.
+/// The proof that no eigenvalue is missing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Certificate {
     /// Every eigenvalue below this was found; at least the k-th lies below. Infinite if all n are.
@@ -91,17 +93,17 @@ pub struct Certificate {
     pub growth: f64,
     /// Connected components of W.
     pub n_components: usize,
-    /// Largest Krylov space that was used; 0 when all components were solved densely.
+    /// Dimension of the largest Krylov space; 0 when all components were solved densely.
     pub n_krylov: usize,
-    /// Rounds of inverse iteration that residuals needed.
+    /// Rounds of inverse iteration that the residuals needed.
     pub n_polish: usize,
-    /// Rounds in which pairs missed at first were looked for.
+    /// Rounds of search for pairs that the first iteration missed.
     pub n_repair: usize,
 }
 
 impl Certificate {
-    /// Whether the count holds for the matrix as given, whatever rounding did: no eigenvalue within
-    /// `perturbation` of `tau`. If not, pairs and count agree all the same, but that is no proof.
+    /// Whether the count holds for the matrix as given, regardless of rounding: no eigenvalue is
+    /// within `perturbation` of `tau`. If false, pairs and count still agree, but that is no proof.
     ///
     /// ```
     /// use coseg_geometry::mesh::icosphere;
@@ -131,7 +133,7 @@ pub struct Spectrum {
     pub eigenvectors: DMatrix<f64>,
     /// `‖W φ - λ A φ‖` in the norm of `A⁻¹`, `(k,)`.
     pub residuals: Vec<f64>,
-    /// Why none is missing.
+    /// The proof that no eigenvalue is missing.
     pub certificate: Certificate,
 }
 
@@ -161,9 +163,9 @@ impl Spectrum {
     /// The `k` smallest eigenpairs of `W φ = λ A φ`: `stiffness` W `(n, n)` symmetric positive
     /// semidefinite, `mass` the diagonal of A `(n,)`, positive; `1 <= k <= n`.
     ///
-    /// Disconnected domains are fine (an eigenvalue 0 for each component). The cost is about `n k²`
-    /// for surfaces, `n³` for the dense route (k above about n/3). The eigenvectors are copied
-    /// once, out of the solver's memory; [`Eigenpairs::smallest`] leaves them there.
+    /// Disconnected domains are allowed (they have an eigenvalue 0 for each component). The cost is
+    /// about `n k²` for surfaces, `n³` for the dense solver (k above about n/3). The eigenvectors
+    /// are copied once, out of the solver's memory; [`Eigenpairs::smallest`] leaves them there.
     ///
     /// ```
     /// use coseg_geometry::mesh::icosphere;
@@ -180,8 +182,8 @@ impl Spectrum {
     /// ```
     ///
     /// # Errors
-    /// Matrices that are not as above, a cancelled solve, or a spectrum whose completeness could
-    /// not be shown: see [`SpectrumError`].
+    /// If the matrices violate the conditions above, the solve is cancelled, or completeness cannot
+    /// be proved: see [`SpectrumError`].
     pub fn smallest(
         stiffness: &sprs::CsMat<f64>,
         mass: &[f64],
@@ -192,7 +194,7 @@ impl Spectrum {
     }
 }
 
-/// Checks what is given, and solves each component.
+/// Validates the arguments and solves each component.
 fn solve(
     stiffness: &sprs::CsMat<f64>,
     mass: &[f64],
@@ -226,8 +228,8 @@ fn solve(
     Ok((parts, solved))
 }
 
-/// Solves each component for its share of the `k` smallest pairs. The shares come from counts at a
-/// common limit, so that no component is solved for more than it contributes (plus one pair).
+/// Solves each component for its share of the `k` smallest pairs. The shares are counts at a common
+/// limit, so that no component is solved for more than it contributes (plus one pair).
 fn solve_components(
     parts: &[Component],
     k: usize,
@@ -248,7 +250,7 @@ fn solve_components(
         let slack = k + k / 5 + 8;
         let (mut low, mut high) = (0.0f64, 4.4 * std::f64::consts::PI * k as f64 / area);
         let mut counts = count(high)?;
-        // Beyond Gershgorin's bound the count is n, so this ends.
+        // Beyond Gershgorin's bound the count is n, so this loop ends.
         while !enough(&counts) {
             low = high;
             high *= 2.0;

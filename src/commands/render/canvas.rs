@@ -1,9 +1,9 @@
-//! Pixels, text and the PNG they become.
+//! Draws pixels and text, and encodes them as PNG.
 
 use font8x8::UnicodeFonts as _;
 use std::io;
 
-/// Pixels of a character, both ways.
+/// Width and height of a character in pixels.
 pub(super) const GLYPH: usize = 8;
 
 /// A picture, row by row, sRGB.
@@ -14,7 +14,7 @@ pub(super) struct Canvas {
 }
 
 impl Canvas {
-    /// All white.
+    /// Creates a white picture.
     pub(super) fn new(width: usize, height: usize) -> Self {
         Self {
             width,
@@ -22,7 +22,7 @@ impl Canvas {
         }
     }
 
-    /// Of pixels row by row.
+    /// Creates a picture from pixels row by row.
     pub(super) fn of_pixels(width: usize, pixels: Vec<[u8; 3]>) -> Self {
         Self { width, pixels }
     }
@@ -35,7 +35,7 @@ impl Canvas {
         self.pixels.len() / self.width.max(1)
     }
 
-    /// Fills a rectangle; what is outside is left out.
+    /// Fills a rectangle, clipped to the picture.
     pub(super) fn fill(
         &mut self,
         x: usize,
@@ -51,14 +51,14 @@ impl Canvas {
         }
     }
 
-    /// Copies another picture to a place; what is outside is left out.
+    /// Copies another picture to a position, clipped to this picture.
     pub(super) fn put(&mut self, x: usize, y: usize, other: &Self) {
         for (i, &pixel) in other.pixels.iter().enumerate() {
             self.fill(x + i % other.width, y + i / other.width, 1, 1, pixel);
         }
     }
 
-    /// Writes a line of text; a character that the font lacks is a question mark.
+    /// Writes a line of text; a character that the font lacks becomes a question mark.
     pub(super) fn text(&mut self, x: usize, y: usize, text: &str, colour: [u8; 3]) {
         for (i, c) in text.chars().enumerate() {
             let fonts = [font8x8::BASIC_FONTS.get(c), font8x8::LATIN_FONTS.get(c)];

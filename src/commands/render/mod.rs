@@ -1,4 +1,4 @@
-//! `coseg render`: a collection as one picture, each shape in the colours of its labels.
+//! `coseg render` draws a collection as one picture, with each shape in the colours of its labels.
 
 mod canvas;
 pub(crate) mod pair;
@@ -15,13 +15,13 @@ use coseg::mesh::ParsedMesh;
 use serde_json::json;
 use view::View;
 
-/// Pixels of a shape's square, without its name.
+/// Width and height of a shape's square in pixels, without its name.
 const CELL: usize = 240;
-/// Pixels around things.
+/// Margin in pixels.
 const MARGIN: usize = 8;
-/// Pixels of a line of text.
+/// Height of a line of text in pixels.
 const LINE: usize = GLYPH + 6;
-/// Columns for each row: sheets are wider than high.
+/// Ratio of columns to rows: sheets are wider than high.
 const ASPECT: f64 = 1.5;
 
 pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
@@ -94,7 +94,7 @@ fn columns(n_shapes: usize) -> usize {
     ((n_shapes as f64 * ASPECT).sqrt().ceil() as usize).clamp(1, n_shapes.max(1))
 }
 
-/// Labels in use: text and colour.
+/// Labels in use: text and colour of each.
 fn legend(labels: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
     let in_use = labels.iter().filter(|l| l.n_shapes > 0);
     in_use
@@ -110,12 +110,12 @@ fn legend(labels: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
         .collect()
 }
 
-/// Pixels of an entry: a square, its text, a gap.
+/// Width of an entry in pixels: a square, its text, a gap.
 fn entry_width(text: &str) -> usize {
     GLYPH * (text.chars().count() + 4)
 }
 
-/// Where each entry goes: column in pixels, and line.
+/// The position of each entry: column in pixels, and line.
 fn places(legend: &[(String, [u8; 3])], width: usize) -> Vec<(usize, usize)> {
     let (mut x, mut line) = (MARGIN, 0);
     let place = |(text, _): &(String, [u8; 3])| {
@@ -141,7 +141,7 @@ fn draw_legend(sheet: &mut Canvas, legend: &[(String, [u8; 3])]) {
     }
 }
 
-/// As much of a name as fits.
+/// A name, shortened to fit.
 fn fitting(name: &str, width: usize) -> String {
     let most = width / GLYPH;
     if name.chars().count() <= most {

@@ -1,5 +1,6 @@
-//! Two shapes and the map between them as one picture: colours that say where a point lies on the first are carried to
-//! the second, and the entries of the functional map stand beside them.
+//! Draws two shapes and the map between them as one picture: the map transfers colours that encode
+//! positions on the first shape to the second, and the entries of the functional map appear beside
+//! them.
 
 use super::canvas::Canvas;
 use super::view::View;
@@ -17,7 +18,7 @@ pub(crate) struct Side {
     faces: Vec<[u32; 3]>,
 }
 
-/// What is drawn.
+/// The data of the picture.
 pub(crate) struct Sheet {
     /// Shape 1.
     pub(crate) from: Side,
@@ -32,7 +33,7 @@ pub(crate) struct Sheet {
 }
 
 impl Side {
-    /// From the daemon.
+    /// Requests the shape from the daemon.
     pub(crate) fn receive(
         session: &mut Session,
         collection: &str,
@@ -63,7 +64,7 @@ impl Side {
         })
     }
 
-    /// Red, green and blue for the three coordinates, over the box of the shape.
+    /// Red, green and blue for the three coordinates, over the bounding box of the shape.
     fn colours(&self) -> Vec<[f64; 3]> {
         let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for v in &self.vertices {
@@ -96,7 +97,7 @@ impl Sheet {
     /// The picture as a PNG file.
     ///
     /// # Errors
-    /// The map is not one between these shapes.
+    /// If the map does not fit these shapes.
     pub(crate) fn png(&self) -> io::Result<Vec<u8>> {
         let colours = self.from.colours();
         let carried: Option<Vec<[f64; 3]>> = self

@@ -1,4 +1,5 @@
-//! Triangles become a shaded picture: a depth buffer, seen from the front, a little from above and the side.
+//! Draws triangles as a shaded picture with a depth buffer, seen from the front, a little from
+//! above and from the side.
 
 use super::canvas::Canvas;
 
@@ -9,13 +10,13 @@ const FILL: f64 = 0.96;
 /// Turn about the vertical, and tilt towards the viewer, in radians.
 const TURN: f64 = 0.6;
 const TILT: f64 = 0.35;
-/// Where the light comes from (right, up, towards the viewer), and light that is everywhere.
+/// Direction of the light (right, up, towards the viewer), and the share of ambient light.
 const LIGHT: [f64; 3] = [0.35, 0.55, 0.76];
 const AMBIENT: f64 = 0.45;
 
 type Point = [f64; 3];
 
-/// From where a shape is seen: rows are right, up, towards the viewer.
+/// The orientation of a view: rows are right, up, towards the viewer.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct View {
     rows: [Point; 3],
@@ -37,7 +38,8 @@ fn unit(a: Point) -> Point {
 }
 
 impl View {
-    /// With `up` upright. Without, the box of the shape decides: its middle side stands up, its longest lies across.
+    /// With `up`, that axis is vertical. Otherwise the bounding box decides: its middle side is
+    /// vertical, its longest horizontal.
     pub(super) fn new(vertices: &[Point], up: Option<Point>) -> Self {
         let side = |axis: usize| {
             let along = vertices.iter().map(|v| v[axis]);
@@ -50,7 +52,7 @@ impl View {
         axes.sort_by(|a, b| side(*b).total_cmp(&side(*a)).then(a.cmp(b)));
         let base = |axis: usize| [0, 1, 2].map(|i| f64::from(u8::from(i == axis)));
         let up = up.unwrap_or_else(|| base(axes[1]));
-        // The longest side that is not the upright one lies across.
+        // The longest side other than the vertical one is horizontal.
         let across = axes.into_iter().map(base).find(|a| dot(*a, up).abs() < 0.5);
         let right = across.unwrap_or_else(|| base((axes[0] + 1) % 3));
         let front = unit(cross(right, up));
@@ -93,7 +95,7 @@ impl View {
                 [0, 1, 2].map(|i| seen[1][i] - seen[0][i]),
                 [0, 1, 2].map(|i| seen[2][i] - seen[0][i]),
             ));
-            // Lit from both sides: not every mesh has an outside.
+            // Light comes from both sides, since not every mesh has an outside.
             let lit = dot(normal, unit(LIGHT)).abs();
             let shade = AMBIENT + (1.0 - AMBIENT) * lit;
             let colour = colour.map(|c| (f64::from(c) * shade).round() as u8);
@@ -125,14 +127,14 @@ impl View {
     }
 }
 
-/// The samples whose middle a triangle covers, with their depth.
+/// The samples inside a triangle, with their depth.
 fn covered(on: &[Point; 3], n: usize) -> impl Iterator<Item = (usize, f64)> {
     let [a, b, c] = *on;
     let area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]);
     let range = |axis: usize| {
         let low = on.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min);
         let high = on.iter().map(|p| p[axis]).fold(f64::NEG_INFINITY, f64::max);
-        // Casts saturate: what is outside the picture is cut off.
+        // Casts saturate, so parts outside the picture are clipped.
         (low.floor().max(0.0) as usize)..(high.ceil().max(0.0) as usize).min(n)
     };
     let (columns, rows) = (range(0), range(1));

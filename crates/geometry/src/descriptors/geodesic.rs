@@ -1,4 +1,5 @@
-//! Distances along the surface to sixty spread samples say whether a point is central or at an end.
+//! Computes distances along the surface to sixty spread samples; they tell central points from
+//! extremities.
 //!
 //! Average geodesic distance after Hilaga, Shinagawa, Kohmura and Kunii 2001, *Topology Matching for
 //! Fully Automatic Similarity Estimation of 3D Shapes*, with farthest-point samples.
@@ -15,7 +16,7 @@ const LARGEST_RADIUS: f64 = 1.5;
 /// Quantiles of the distances to the samples.
 pub(super) const QUANTILES: [f64; 6] = [0.1, 0.25, 0.5, 0.75, 0.9, 1.0];
 
-/// How far each vertex is from the rest.
+/// Geodesic distances from each vertex to the rest of the surface.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct GeodesicProfile {
     /// Area-weighted mean distance `(n,)`.
@@ -111,7 +112,8 @@ fn start(mesh: &TriMesh, geometry: &FaceGeometry) -> u32 {
     (0..).zip(&mesh.vertices).fold((-1.0, 0), far).1
 }
 
-/// Distances `(n, samples)`, row-major, to farthest-point samples, without the start unless it is alone.
+/// Distances `(n, samples)`, row-major, to farthest-point samples. The start is left out unless it
+/// is the only sample.
 fn samples(graph: &EdgeGraph, start: u32) -> Vec<f64> {
     let n = graph.n_vertices();
     let n_samples = N_SAMPLES.min(n);

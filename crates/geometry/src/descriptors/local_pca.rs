@@ -1,4 +1,5 @@
-//! The surface within three radii of a face, by its principal components: a rod, a sheet or a lump.
+//! Describes the surface within three radii of a face by its principal components: it resembles a
+//! rod, a sheet or a lump.
 
 use crate::mesh::{FaceGeometry, dot};
 use nalgebra::Matrix3;
@@ -10,13 +11,14 @@ const RADII: [f64; 3] = [0.05, 0.1, 0.2];
 const WIDTH: usize = 5;
 /// Columns in all.
 pub(super) const N_COLUMNS: usize = WIDTH * RADII.len();
-/// Edge of the cells that are within a ball, or without, as a whole: of about five faces of a proxy.
+/// Edge of the grid cells, each of which holds about five faces of a proxy. Most cells lie entirely
+/// inside or entirely outside a ball and are counted as a whole.
 const CELL: f64 = 0.05;
 /// Variances below this are rounding.
 const MIN_VARIANCE: f64 = 1e-12;
 
-/// Moments of area about the origin: its sum, of the coordinates, and of their products xx, yy, zz, xy,
-/// yz, zx.
+/// Moments of area about the origin: the area, the sums of the coordinates, and the sums of their
+/// products xx, yy, zz, xy, yz, zx.
 type Moments = [f64; 10];
 
 fn moments(p: [f64; 3], area: f64) -> Moments {
@@ -32,8 +34,8 @@ fn add(sum: &mut Moments, other: &Moments) {
     }
 }
 
-/// Of area about its centroid. Products of coordinates up to 1 leave 1e-16 of rounding, far below
-/// [`MIN_VARIANCE`].
+/// Covariance of the area about its centroid. Products of coordinates up to 1 leave 1e-16 of
+/// rounding, far below [`MIN_VARIANCE`].
 fn covariance(sum: &Moments) -> Matrix3<f64> {
     let mean: [f64; 3] = std::array::from_fn(|i| sum[1 + i] / sum[0]);
     let c: [f64; 6] = std::array::from_fn(|i| {
@@ -82,7 +84,7 @@ pub fn local_pca(geometry: &FaceGeometry) -> Vec<f64> {
     result
 }
 
-/// Faces sorted into the cells of a grid that their centroids are in.
+/// Faces, sorted into the grid cells of their centroids.
 struct Cells {
     cells: Vec<Cell>,
     /// The faces of the first cell, then of the second, …; `points` and `moments` alike.
@@ -92,11 +94,11 @@ struct Cells {
 }
 
 struct Cell {
-    /// Along the first axis, by which cells ascend.
+    /// Index along the first axis; cells ascend by it.
     index: i64,
     first: usize,
     end: usize,
-    /// The box of its centroids.
+    /// The bounding box of its centroids.
     low: [f64; 3],
     high: [f64; 3],
     sum: Moments,
@@ -165,7 +167,8 @@ impl WithSimd for Balls<'_> {
         } = self;
         let reach = (RADII[RADII.len() - 1] / CELL).ceil() as i64;
         for home in &cells.cells {
-            // Cells that are in the balls about all faces of this one, and those that may be in part.
+            // Cells inside the balls about all faces of this cell, and cells that may be partly
+            // inside.
             let mut inside = [[0.0; 10]; RADII.len()];
             let mut crossed: [Vec<(usize, usize)>; RADII.len()] = Default::default();
             let from = cells
@@ -195,7 +198,8 @@ impl WithSimd for Balls<'_> {
                         let members = cells.points[first..end].iter();
                         for (p, moments) in members.zip(&cells.moments[first..end]) {
                             let d = [p[0] - center[0], p[1] - center[1], p[2] - center[2]];
-                            // Multiplying is quicker than branching on what cannot be foreseen.
+                            // The outcome of this comparison is unpredictable, so multiplying is
+                            // faster than branching.
                             let within = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= square;
                             let weight = f64::from(u8::from(within));
                             for (a, b) in ball.iter_mut().zip(moments) {
@@ -210,7 +214,7 @@ impl WithSimd for Balls<'_> {
     }
 }
 
-/// Squares of the least and of the largest distance between points of the boxes of two cells.
+/// Squares of the least and the largest distance between points of the bounding boxes of two cells.
 #[inline(always)]
 fn distances(a: &Cell, b: &Cell) -> (f64, f64) {
     let (mut least, mut most) = (0.0, 0.0);
@@ -225,7 +229,7 @@ fn distances(a: &Cell, b: &Cell) -> (f64, f64) {
 
 fn describe(ball: &Moments, radius: f64, normal: [f64; 3], columns: &mut [f64]) {
     let (e, axes) = principal(covariance(ball));
-    // A face alone in its ball has no axis.
+    // A ball with a single face has no axis.
     let axis = if e[0] > MIN_VARIANCE {
         axes[0]
     } else {

@@ -1,10 +1,11 @@
-//! A proxy mesh and its spectrum become arrays that say what each point, each face and the whole shape
-//! look like, whatever the pose, place and numbering.
+//! Computes descriptors of the points, the faces and the whole of a shape from its proxy mesh and
+//! spectrum. Descriptors do not depend on pose, position or numbering.
 //!
-//! Vertex descriptors: [`hks`] (the source paper's eq. 8), [`wks`], [`gps`]. Face descriptors, 92 columns
-//! in the [`GROUPS`], are what labels are told by: thickness, position along geodesics, local shape,
-//! place in the principal frame, and heat and wave kernels. [`signature`] sums up a shape.
-//! Lengths are in units of the square root of the area: the mesh has area 1.
+//! Vertex descriptors are [`hks`] (the source paper's eq. 8), [`wks`] and [`gps`]. Face descriptors
+//! have 92 columns, in the [`GROUPS`]: thickness, position along geodesics, local shape, position
+//! in the principal frame, and heat and wave kernels; the label model predicts labels from them.
+//! [`signature`] summarises a shape. Lengths are in units of the square root of the area: the mesh
+//! has area 1.
 
 mod geodesic;
 mod local_pca;
@@ -48,13 +49,14 @@ pub const GROUPS: &[(&str, usize)] = &[
     ("wks", N_WAVE_ENERGIES),
 ];
 
-/// Heat and wave kernels of faces use this many eigenpairs, so that shapes with more do not differ.
+/// The number of eigenpairs that the heat and wave kernels of faces use, so that shapes with more
+/// eigenpairs get comparable values.
 const MAX_EIGENPAIRS: usize = 100;
 const N_HEAT_TIMES: usize = 16;
 const N_WAVE_ENERGIES: usize = 20;
 /// Kernel values below this are noise of the truncated sum.
 const MIN_KERNEL: f64 = 1e-6;
-/// Thicknesses below this are none.
+/// Thicknesses below this count as zero.
 const MIN_DIAMETER: f64 = 1e-4;
 /// Rounds of smoothing of the shape diameter, which rays make noisy, and of all columns at the end.
 const DIAMETER_ROUNDS: usize = 3;
@@ -71,8 +73,8 @@ pub struct FaceDescriptors {
     pub farthest_start: u32,
 }
 
-/// The kernels that [`face_descriptors`] takes, for the `eigenvalues` of a proxy; as many columns
-/// of eigenvectors count as it takes pairs of: at most 100.
+/// The kernels that [`face_descriptors`] takes, for the `eigenvalues` of a proxy. They use at most
+/// the first 100 eigenpairs, and so at most 100 columns of eigenvectors.
 ///
 /// ```
 /// use coseg_geometry::descriptors::face_kernels;
@@ -261,8 +263,8 @@ fn quantile(sorted: &[f64], q: f64) -> f64 {
     sorted[below] + (at - below as f64) * (sorted[above] - sorted[below])
 }
 
-/// Values at faces `(m, dim)` become half themselves and half the mean of their neighbours, `rounds`
-/// times. Bridges do not count: a component keeps what is its own.
+/// Replaces values at faces `(m, dim)` by the mean of themselves and the mean of their neighbours,
+/// `rounds` times. Bridges do not count, so components do not mix.
 fn smooth(dual: &DualGraph, values: &mut [f64], dim: usize, rounds: usize) {
     let mut sum = vec![0.0; dim];
     for _ in 0..rounds {

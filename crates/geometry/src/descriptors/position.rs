@@ -1,4 +1,5 @@
-//! Where a face lies in the shape: in its principal frame, or along a known up axis.
+//! Computes the position of each face in the shape: in its principal frame, or along a known up
+//! axis.
 
 use super::local_pca::principal;
 use super::smooth;
@@ -11,9 +12,9 @@ pub(super) const N_COLUMNS: usize = 7;
 pub const N_UP_COLUMNS: usize = 5;
 /// Layers in which the area along the up axis is counted.
 const N_LAYERS: usize = 256;
-/// Rounds of smoothing of the columns along the up axis, as of all face descriptors.
+/// Rounds of smoothing of the columns along the up axis; all face descriptors have as many.
 const ROUNDS: usize = 2;
-/// Extents below this are none.
+/// Extents below this count as zero.
 const MIN_EXTENT: f64 = 1e-9;
 
 fn centroid(geometry: &FaceGeometry) -> [f64; 3] {
@@ -61,9 +62,9 @@ pub fn position(geometry: &FaceGeometry) -> Vec<f64> {
 /// For each face of a mesh whose `up` is known: height from 0 at the lowest to 1 at the highest
 /// face, distance from the vertical through the centroid over the largest one, the cosine of normal
 /// and up, its absolute value (a plate has the same above and below), and the share of the area
-/// that is lower (a seat is the middle of a chair, however long the legs); smoothed like the other
-/// face descriptors. `up` need not be of length 1; a flat or pole-like shape has 0 where there is
-/// no extent.
+/// that is lower (a seat is the middle of a chair, however long the legs). The columns are smoothed
+/// like the other face descriptors. `up` need not have length 1. A column is 0 where the shape has
+/// no extent, as in a flat or pole-like shape.
 ///
 /// ```
 /// use coseg_geometry::descriptors::up_columns;
@@ -103,7 +104,7 @@ pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; N_UP_COLUMNS]> {
             [heights[f], radius, slope, slope.abs(), lower[f]]
         })
         .collect();
-    // Smoothing does not cross bridges, so the graph does without them.
+    // Smoothing does not cross bridges, so this graph omits them.
     smooth(
         &DualGraph::new(mesh, &[]),
         &mut values,
@@ -114,8 +115,8 @@ pub fn up_columns(mesh: &TriMesh, up: [f64; 3]) -> Vec<[f32; N_UP_COLUMNS]> {
     rows.iter().map(|row| row.map(|x| x as f32)).collect()
 }
 
-/// Share of the area below each of `heights` (0 to 1), linear within each of so many layers: faces of one height
-/// have one value, however many there are.
+/// Share of the area below each of `heights` (0 to 1), interpolated linearly within each layer.
+/// Faces of equal height have equal values, however many there are.
 fn lower_area(heights: &[f64], areas: &[f64]) -> Vec<f64> {
     let mut layers = [0.0; N_LAYERS];
     let layer = |h: f64| ((h * N_LAYERS as f64) as usize).min(N_LAYERS - 1);

@@ -1,4 +1,4 @@
-//! Rays cast inward from each face say how thick the shape is there.
+//! Measures the thickness of a shape at each face by rays that are cast inward.
 //!
 //! Shapira, Shamir and Cohen-Or 2008, *Consistent mesh partitioning and skeletonisation using the shape
 //! diameter function*.
@@ -12,19 +12,19 @@ const N_RAYS: usize = 30;
 const HALF_ANGLE: f64 = 60.0;
 /// Turn from one ray to the next about the axis, in radians: the golden angle spreads them evenly.
 const TURN: f64 = 2.399_963;
-/// Lengths farther from the median than this many standard deviations are of rays gone astray.
+/// Lengths farther than this many standard deviations from the median are outliers.
 const OUTLIER: f64 = 1.5;
 /// Softens the weight 1 / angle of rays near the axis.
 const ANGLE_OFFSET: f64 = 0.2;
-/// Rays begin this far below the face, so as not to meet its neighbours in their common edges.
+/// Rays begin this far below the face, so that they miss its neighbours at their common edges.
 const DEPTH: f64 = 1e-4;
 
 /// Shape diameter of each face `(m,)` of a mesh of area 1: the weighted mean length of rays within
 /// 60° of the inward normal, without outliers. It has the unit of the mesh.
 ///
-/// Rays that leave through an opening do not count. A face none of whose rays meets anything gets
-/// the median of the others; on a mesh where no ray does (a sheet) all are 0. O(m log m) with 30 m
-/// rays.
+/// Rays that leave through an opening do not count. A face whose rays all miss gets the median of
+/// the other faces; on a mesh where every ray misses (a sheet) all values are 0. O(m log m) with 30
+/// m rays.
 ///
 /// ```
 /// use coseg_geometry::descriptors::shape_diameter;
@@ -45,7 +45,8 @@ pub fn shape_diameter(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<f64> {
     let mut diameters: Vec<Option<f64>> = Vec::with_capacity(mesh.faces.len());
     for f in 0..mesh.faces.len() {
         let inward = scale(geometry.normals[f], -1.0);
-        // Rays turn with the face: its longest edge is where their circle begins.
+        // The circle of rays begins at the longest edge of the face, so the rays turn with the
+        // face.
         let x = unit(longest_edge(mesh.corners(f)));
         let y = cross(inward, x);
         let origin = add(geometry.centroids[f], scale(inward, DEPTH));
@@ -65,7 +66,7 @@ pub fn shape_diameter(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<f64> {
     diameters.into_iter().map(|d| d.unwrap_or(median)).collect()
 }
 
-/// Along the face, so that the numbering of its corners does not matter.
+/// The direction of the longest edge; it does not depend on the numbering of the corners.
 fn longest_edge([a, b, c]: [[f64; 3]; 3]) -> [f64; 3] {
     let edges = [sub(b, a), sub(c, b), sub(a, c)];
     edges
@@ -87,12 +88,12 @@ fn cone() -> [([f64; 3], f64); N_RAYS] {
         ];
         (direction, 1.0 / (angle + ANGLE_OFFSET))
     });
-    // Around the axis: neighbours meet mostly the same boxes.
+    // Sorted around the axis: rays that are neighbours mostly cross the same boxes.
     rays.sort_by(|(a, _), (b, _)| a[1].atan2(a[0]).total_cmp(&b[1].atan2(b[0])));
     rays
 }
 
-/// Weighted mean of the lengths near the median; `None` of none.
+/// Weighted mean of the lengths near the median; `None` for no lengths.
 fn robust_mean(lengths: &mut [(f64, f64)]) -> Option<f64> {
     lengths.sort_by(|a, b| a.0.total_cmp(&b.0));
     let sorted: Vec<f64> = lengths.iter().map(|l| l.0).collect();
@@ -130,7 +131,7 @@ mod tests {
         let chord = robust_mean(&mut chords).unwrap();
         assert!(chord > 1.4 * radius && chord < 2.0 * radius);
         for x in d {
-            // Facets.
+            // The tolerance allows for the facets of the mesh.
             assert!((x / chord - 1.0).abs() < 0.02, "{x} against {chord}");
         }
     }

@@ -1,4 +1,5 @@
-//! The face descriptors and the spectrum of a shape become one vector, by which similar shapes are found.
+//! Computes one vector from the face descriptors and the spectrum of a shape; similar shapes have
+//! similar vectors.
 
 use super::{FaceDescriptors, shape_dna};
 use crate::mesh::{FaceGeometry, TriMesh};
@@ -10,7 +11,7 @@ pub const N_SHAPE_DNA: usize = 20;
 
 /// Signature `(4 n + 20,)` of a shape whose face descriptors have n columns: their means over the
 /// area, then their 0.1, 0.5 and 0.9 quantiles over the area, then 20 logarithms of eigenvalues.
-/// Nothing is standardised or weighted: that needs the other shapes. O(m n log m).
+/// Nothing is standardised or weighted here, since that needs the other shapes. O(m n log m).
 ///
 /// ```
 /// use coseg_geometry::descriptors::{FaceDescriptors, signature};
@@ -29,7 +30,7 @@ pub fn signature(mesh: &TriMesh, face: &FaceDescriptors, eigenvalues: &[f64]) ->
     let total: f64 = areas.iter().sum();
     let n = face.n;
     let mut result = vec![0.0; n * (1 + QUANTILES.len())];
-    // A value and its face in one word, which sorts faster than a pair.
+    // Packs a value and its face into one word, which sorts faster than a pair.
     let mut column: Vec<u64> = Vec::with_capacity(areas.len());
     for j in 0..n {
         column.clear();
@@ -57,7 +58,7 @@ pub fn signature(mesh: &TriMesh, face: &FaceDescriptors, eigenvalues: &[f64]) ->
     result
 }
 
-/// Bits that are ordered as the numbers are.
+/// Maps a float to bits that have the same order as the numbers.
 fn order_bits(x: f32) -> u32 {
     let bits = x.to_bits();
     if bits >> 31 == 0 {

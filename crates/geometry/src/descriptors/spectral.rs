@@ -1,5 +1,5 @@
-//! Eigenpairs of the Laplacian become descriptors of points (heat and wave kernel signatures, global
-//! point signature) and of the shape (ShapeDNA).
+//! Computes descriptors of points (heat and wave kernel signatures, global point signature) and of
+//! the shape (ShapeDNA) from eigenpairs of the Laplacian.
 //!
 //! Sun, Ovsjanikov and Guibas 2009, *A Concise and Provably Informative Multi-Scale Signature Based on
 //! Heat Diffusion*; Aubry, Schlickewei and Cremers 2011, *The Wave Kernel Signature*; Rustamov 2007,
@@ -12,12 +12,13 @@ use nalgebra::DMatrix;
 
 /// Eigenvalues up to this fraction of the largest one given are zero: solvers leave about 1e-10.
 const ZERO: f64 = 1e-7;
-/// The smallest eigenvalue that sets a time, for a mesh of area 1: a time above it sees nothing but a
+/// The smallest eigenvalue that sets a time, for a mesh of area 1: at longer times the kernel is
 /// constant.
 const MIN_EIGENVALUE: f64 = 1e-3;
 /// Width of the wave kernel's energy bands, in percent of the range of energies, from the paper.
 const WAVE_WIDTH: f64 = 0.07;
-/// Points whose rows of eigenvectors are worked on together: few enough to stay in the cache.
+/// Number of points whose rows of eigenvectors are processed together: few enough to stay in the
+/// cache.
 const BATCH: usize = 48;
 
 /// Number of eigenvalues (ascending) that are zero: one for each component of the domain.
@@ -65,8 +66,8 @@ fn ends(eigenvalues: &[f64]) -> Option<(f64, f64)> {
     eigenvalues.last().map(|&last| (first, last))
 }
 
-/// The heat and wave kernel signatures of points from their rows of eigenvectors: one pass over the squares,
-/// one matrix product with the exponentials.
+/// Computes the heat and wave kernel signatures of points from their rows of eigenvectors in one
+/// pass over the squares, as one matrix product with the exponentials.
 #[derive(Debug)]
 pub struct PointKernels {
     weights: SquareWeights,
@@ -101,12 +102,12 @@ impl PointKernels {
         }
     }
 
-    /// Times and energies.
+    /// Number of times plus number of energies.
     pub fn n_columns(&self) -> usize {
         self.weights.n_out()
     }
 
-    /// Times.
+    /// Number of times.
     pub fn n_times(&self) -> usize {
         self.n_times
     }
@@ -116,17 +117,17 @@ impl PointKernels {
         self.weights.flops()
     }
 
-    /// For rows of eigenvectors, `width` numbers apart, of which the first k count, the kernels at all
-    /// times, then those at all energies: `(rows, n_columns)`.
+    /// The kernels of rows of eigenvectors, `width` numbers apart, of which the first k count:
+    /// first at all times, then at all energies, `(rows, n_columns)`.
     ///
     /// # Panics
-    /// `out` has not as many rows.
+    /// If `out` has a different number of rows.
     pub fn of_rows(&self, rows: &[f64], width: usize, out: &mut [f64]) {
         self.weights.apply(rows, width, out);
     }
 
-    /// The same for a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major. Columns beyond
-    /// the k-th do not count.
+    /// The kernels of a matrix `(n, k)` of eigenvectors: `(n, n_columns)`, row-major. Columns
+    /// beyond the k-th do not count.
     ///
     /// ```
     /// use coseg_geometry::descriptors::{PointKernels, hks};
@@ -161,9 +162,9 @@ impl PointKernels {
     }
 }
 
-/// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs there
-/// are both a value `(k,)` and a vector `(n, k)` of. Positive; the unit is 1 / area, and for large
-/// times it is 1 over the area of the component. O(n k times), as one matrix product.
+/// Heat kernel signature `(n, times)`, row-major: `Σ_i exp(−λ_i t) φ_i(x)²`, over the pairs for
+/// which both a value `(k,)` and a vector `(n, k)` are given. Positive; the unit is 1 / area, and
+/// for large times it is 1 over the area of the component. O(n k times), as one matrix product.
 ///
 /// ```
 /// use coseg_geometry::descriptors::{hks, hks_times};
@@ -314,13 +315,14 @@ pub fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
     let (Some(&low), Some(&high)) = (logs.first(), logs.last()) else {
         return weights;
     };
-    // With a single energy any width gives the same.
+    // With a single energy the width does not matter.
     let width = (WAVE_WIDTH * (high - low)).max(f64::MIN_POSITIVE.sqrt());
     let steps = n_energies.saturating_sub(1).max(1) as f64;
     for j in 0..n_energies {
         let energy = low + (high - low) * j as f64 / steps;
         let exponent = |log: f64| -0.5 * ((energy - log) / width).powi(2);
-        // Relative to the nearest eigenvalue: in a gap wider than the bands all would vanish.
+        // Weights are relative to the nearest eigenvalue: in a gap wider than the bands all would
+        // vanish.
         let most = logs
             .iter()
             .map(|&l| exponent(l))
@@ -333,7 +335,7 @@ pub fn wave_weights(eigenvalues: &[f64], n_energies: usize) -> DMatrix<f64> {
     weights
 }
 
-/// In single precision.
+/// Converts to single precision.
 fn to_single(values: &[f64]) -> Vec<f32> {
     values.iter().map(|&x| x as f32).collect()
 }
@@ -391,7 +393,7 @@ mod tests {
                 assert!((f64::from(h[2 * v]) - heat[(v, v)]).abs() < 1e-6);
             }
         }
-        // At once all of the heat is where it was put, in the end it is everywhere the same.
+        // At time 0 all heat is at its source; in the limit it is uniform.
         let h = hks(&values, &vectors, &[0.0, 1e9]);
         assert!(
             h.chunks(2)
@@ -415,7 +417,7 @@ mod tests {
                 assert!((f64::from(w[v * 5 + j]) - all[v * 8 + 3 + j]).abs() < 1e-6);
             }
         }
-        // At the lowest energy the lowest vibration, at the highest the highest.
+        // The lowest energy has the lowest vibration, the highest energy the highest.
         for v in 0..n {
             assert!((f64::from(w[v * 5]) - vectors[(v, 1)].powi(2)).abs() < 1e-3);
             assert!((f64::from(w[v * 5 + 4]) - vectors[(v, 3)].powi(2)).abs() < 1e-3);

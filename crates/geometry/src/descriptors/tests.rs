@@ -4,8 +4,8 @@ use super::{
 use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh, bridges, clean, distance, proxy, zoo};
 use nalgebra::{DMatrix, DVector};
 
-/// Eigenpairs of a simple graph Laplacian over lumped areas: enough structure for these tests, whatever
-/// the operators do.
+/// Eigenpairs of a simple graph Laplacian over lumped areas: these tests need no more structure,
+/// and do not depend on the operators.
 fn spectrum(mesh: &TriMesh, bridges: &[Bridge], k: usize) -> (Vec<f64>, DMatrix<f64>) {
     let n = mesh.vertices.len();
     let mut mass = vec![0.0; n];
@@ -152,7 +152,7 @@ fn everything_is_finite_on_the_zoo() {
                 "{name} with {k} pairs"
             );
         }
-        // As it is, however coarse.
+        // A coarse mesh is used as it is.
         if mesh.vertices.len() < 300 {
             assert!(
                 describe(&mesh, 60).data.iter().all(|v| v.is_finite()),
@@ -166,7 +166,7 @@ fn everything_is_finite_on_the_zoo() {
 fn heat_on_a_sphere_is_everywhere_the_same() {
     // The icosahedron's symmetry leaves a few kinds of vertices, close to each other.
     let mesh = clean(&zoo::parsed(&zoo::sphere(3))).unwrap().mesh;
-    // Complete eigenspaces: l = 0 … 5 has 36 pairs.
+    // Complete eigenspaces: l = 0 … 5 have 36 pairs.
     let (values, vectors) = spectrum(&mesh, &[], 36);
     let times = hks_times(&values, 10);
     let h = hks(&values, &vectors, &times);

@@ -1,4 +1,4 @@
-//! The spectral basis of a shape, and the dense products that maps are made of.
+//! Holds the spectral basis of a shape, and provides the dense products that maps need.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};

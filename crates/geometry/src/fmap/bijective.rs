@@ -1,9 +1,10 @@
-//! Two functional maps, there and back, refine each other: bijective ZoomOut.
+//! Refines two functional maps, there and back, by each other: bijective ZoomOut.
 //!
-//! Ren et al. 2020, *MapTree: Recovering Multiple Solutions in the Space of Maps*. A vertex v of shape 2 and a vertex
-//! u of shape 1 are as far apart as `[Φ₂, Φ₂ C₂₁ᵀ](v)` and `[Φ₁ C₁₂ᵀ, Φ₁](u)`: in the basis of shape 2 by the map
-//! there, in that of shape 1 by the map back. Nearest neighbours in both directions come from one product, and each
-//! keeps the other from collapsing onto a part of the surface.
+//! Ren et al. 2020, *MapTree: Recovering Multiple Solutions in the Space of Maps*. The distance of
+//! a vertex v of shape 2 and a vertex u of shape 1 is that of `[Φ₂, Φ₂ C₂₁ᵀ](v)` and `[Φ₁ C₁₂ᵀ,
+//! Φ₁](u)`: it compares them in the basis of shape 2 by the map there, and in that of shape 1 by
+//! the map back. Nearest neighbours in both directions come from one product, and each map keeps
+//! the other from collapsing onto a part of the surface.
 
 use super::basis::{product, product_transposed, transposed_product};
 use super::orientation::Orientation;
@@ -21,7 +22,7 @@ pub struct Pair {
     pub c_21: Vec<f32>,
 }
 
-/// Descriptors at the samples of both shapes, kept in the nearest-neighbour search.
+/// Descriptors at the samples of both shapes, which the nearest-neighbour search includes.
 #[derive(Debug, Clone, Copy)]
 pub struct Guidance<'a> {
     /// `(n1, dim)`, row-major, of mean squared norm 1.
@@ -34,7 +35,7 @@ pub struct Guidance<'a> {
     pub weight: f32,
 }
 
-/// Which orientation a map shall keep or reverse while it is small.
+/// The orientation that a map must keep or reverse while it is small.
 #[derive(Debug, Clone, Copy)]
 pub struct Turn<'a> {
     /// Of shape 1.
@@ -45,11 +46,12 @@ pub struct Turn<'a> {
     pub sign: f32,
     /// Mean squared norm of the crossed functions relative to the spectral coordinates.
     pub weight: f32,
-    /// The largest map that is turned.
+    /// The largest size of a map for which orientation is imposed.
     pub k_max: usize,
 }
 
-/// Columns that are searched together with the spectral coordinates, at the samples of both shapes.
+/// The columns that are searched together with the spectral coordinates, at the samples of both
+/// shapes.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Hints {
     one: Vec<f32>,
@@ -58,7 +60,8 @@ pub struct Hints {
 }
 
 impl Hints {
-    /// For the next search of `pair`. Spectral coordinates in both bases have a mean squared norm of about 2k.
+    /// The columns for the next search of `pair`. Spectral coordinates in both bases have a mean
+    /// squared norm of about 2k.
     fn new(
         pair: &Pair,
         one: &SampledBasis,
@@ -72,7 +75,7 @@ impl Hints {
             let (x1, x2, dim) = t.one.at_samples(t.two, &pair.c_12, pair.k, rows_1, rows_2);
             (x1, x2, dim, scale(t.weight), t.sign)
         });
-        // Columns at the samples of shape 1 and of shape 2, how many, and what they are scaled by.
+        // Columns at the samples of shape 1 and of shape 2, their number, and their scale.
         let (mut ones, mut twos) = (Vec::new(), Vec::new());
         if let Some(g) = guidance.filter(|g| g.weight > 0.0) {
             ones.push((g.one, g.dim, scale(g.weight)));
@@ -90,7 +93,8 @@ impl Hints {
     }
 }
 
-/// Matrices of `n` rows, each with its columns and a factor, become one, `(n, sum of their columns)`.
+/// Joins matrices of `n` rows, each with its number of columns and a factor, to one, `(n, sum of
+/// their columns)`.
 fn side_by_side(parts: &[(&[f32], usize, f32)], n: usize) -> Vec<f32> {
     let dim: usize = parts.iter().map(|(_, dim, _)| dim).sum();
     let mut rows = Vec::with_capacity(n * dim);
@@ -142,7 +146,7 @@ impl Pair {
         nearest_both(&queries, &targets, 2 * k + dim)
     }
 
-    /// The maps of size `k` that belong to pointwise maps between samples.
+    /// The maps of size `k` that follow from pointwise maps between samples.
     pub fn from_pointwise(
         one: &SampledBasis,
         two: &SampledBasis,
@@ -183,8 +187,8 @@ impl Pair {
         self
     }
 
-    /// How far the maps are from being orthogonal and inverse to each other: the mean over both directions of
-    /// `‖CᵀC − I‖²/k`, plus `‖C₁₂ C₂₁ − I‖²/k`.
+    /// The deviation of the maps from being orthogonal and inverse to each other: the mean over
+    /// both directions of `‖CᵀC − I‖²/k`, plus `‖C₁₂ C₂₁ − I‖²/k`.
     pub fn strain(&self) -> f64 {
         let k = self.k;
         let departure = |m: &[f32]| {

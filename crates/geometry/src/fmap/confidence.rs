@@ -1,30 +1,33 @@
-//! What a map shows of itself becomes the share of labels that it is expected to carry rightly, as a whole and at each
-//! vertex, and the vertices to which nothing corresponds.
+//! Predicts the share of labels that a map transfers correctly, as a whole and at each vertex, and
+//! the vertices without counterpart.
 //!
-//! Logistic in the logarithms of two figures, both squared differences of descriptors: the residual, between a vertex and
-//! its match, and the return, between a vertex and what its match is matched with in turn. The latter is large where
-//! many vertices crowd onto one, and bears it when left and right are mixed. Fitted to the maps between all pairs of
-//! twenty shapes of ten classes with known labels; each class was predicted from the other nine to see what that is worth.
+//! The prediction is logistic in the logarithms of two figures, both squared differences of
+//! descriptors: the residual, between a vertex and its match, and the return, between a vertex and
+//! the match of its match. The return is large where many vertices crowd onto one, and reliable
+//! where left and right are mixed. The weights are fitted to the maps between all pairs of twenty
+//! shapes of ten classes with known labels; each class was predicted from the other nine to measure
+//! the accuracy of the prediction.
 
 use super::quality::Quality;
 
-/// Of a map: constant, ln residual, orthogonality, coverage, ln return.
+/// Weights of a map: constant, ln residual, orthogonality, coverage, ln return.
 pub const OF_MAP: [f64; 5] = [0.783, 0.027, 0.481, 1.070, -1.294];
-/// Of a vertex: the same of its map, then ln residual and ln return there.
+/// Weights of a vertex: those of its map, then ln residual and ln return at the vertex.
 const OF_VERTEX: [f64; 7] = [0.585, 0.517, 0.444, 0.304, -1.104, -0.436, -0.175];
-/// That nothing corresponds: constant, ln residual and ln return around a vertex. Fitted to shapes that were mapped to
-/// after one of the parts was cut away from the other shape.
+/// Weights for a missing counterpart: constant, ln residual and ln return around a vertex. They are
+/// fitted to maps to whole shapes from shapes that lack a part.
 const OF_NOTHING: [f64; 3] = [-4.32, 1.14, 0.46];
-/// Probability from which on it is taken that nothing corresponds.
+/// Probability from which a vertex counts as without counterpart.
 const NOTHING_FROM: f64 = 0.4;
-/// Rounds of averaging over the faces around a vertex, before it is judged whether something corresponds.
+/// Rounds of averaging over the faces around a vertex, before its counterpart is judged.
 const N_SMOOTHED: usize = 4;
-/// Added before logarithms, of a map, a vertex and its surroundings.
+/// Offsets that are added before taking logarithms, for a map, a vertex and its surroundings.
 const LEAST: [f64; 3] = [1e-3, 0.02, 0.01];
-/// Steps into which the confidence of a vertex is rounded, so that what is kept is what was used.
+/// Steps to which the confidence of a vertex is rounded, so that the stored value equals the value
+/// in use.
 const STEPS: f64 = 254.0;
 
-/// The figures by which the confidence of a map is predicted, the first of them 1.
+/// The figures from which the confidence of a map is predicted, the first of them 1.
 pub fn figures(quality: &Quality) -> [f64; 5] {
     [
         1.0,
@@ -35,27 +38,28 @@ pub fn figures(quality: &Quality) -> [f64; 5] {
     ]
 }
 
-/// Share of the area that labels are expected to be right on that a map carries, 0 to 1.
+/// Share of the area on which labels that the map transfers are expected to be right, 0 to 1.
 pub fn of_map(quality: &Quality) -> f64 {
     logistic(&OF_MAP, &figures(quality))
 }
 
-/// What to expect of a map at each vertex of shape 2.
+/// The confidence of a map at each vertex of shape 2.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Confidence {
-    /// 0: nothing corresponds; else 1 + 254 times the probability that a carried label is right.
+    /// 0: no counterpart; else 1 + 254 times the probability that a transferred label is right.
     pub of_vertex: Vec<u8>,
 }
 
 impl Confidence {
-    /// The same at each of `n` vertices.
+    /// The same confidence at each of `n` vertices.
     pub fn everywhere(probability: f64, n: usize) -> Self {
         Self {
             of_vertex: vec![1 + (STEPS * probability).round() as u8; n],
         }
     }
 
-    /// From the squared descriptor differences `residuals (n2,)` and `returns (n2,)` of a map to the shape with these faces.
+    /// Predicts the confidence from the squared descriptor differences `residuals (n2,)` and
+    /// `returns (n2,)` of a map to the shape with these faces.
     pub fn new(quality: &Quality, faces: &[[u32; 3]], residuals: &[f32], returns: &[f32]) -> Self {
         let of_map = figures(quality);
         let around = (
@@ -79,7 +83,8 @@ impl Confidence {
         }
     }
 
-    /// The same everywhere, as where only the map as a whole is known; cut to 0 to 1.
+    /// The same confidence everywhere, for when only that of the whole map is known; clamped to 0
+    /// to 1.
     ///
     /// ```
     /// use coseg_geometry::fmap::Confidence;
@@ -93,12 +98,12 @@ impl Confidence {
         }
     }
 
-    /// Whether something corresponds to a vertex.
+    /// Whether a vertex has a counterpart.
     pub fn is_matched(&self, vertex: usize) -> bool {
         self.of_vertex[vertex] > 0
     }
 
-    /// Probability that a label carried to a vertex is right; `None`: nothing corresponds.
+    /// Probability that a label transferred to a vertex is right; `None` without counterpart.
     ///
     /// ```
     /// use coseg_geometry::fmap::Confidence;
@@ -115,7 +120,7 @@ impl Confidence {
         (step > 0).then(|| f64::from(step - 1) / STEPS)
     }
 
-    /// Share of the mass `(n2,)` to which something corresponds, 0 to 1.
+    /// Share of the mass `(n2,)` that has a counterpart, 0 to 1.
     ///
     /// ```
     /// use coseg_geometry::fmap::Confidence;
@@ -139,8 +144,8 @@ impl Confidence {
     }
 }
 
-/// Means over the faces around each vertex of the means of their corners, so many times. Vertices without faces keep
-/// their value.
+/// Replaces values by the means, over the faces around each vertex, of the means of their corners,
+/// `rounds` times. Vertices without faces keep their value.
 pub fn smoothed(faces: &[[u32; 3]], values: &[f32], rounds: usize) -> Vec<f32> {
     let mut values = values.to_vec();
     let mut count = vec![0u32; values.len()];
@@ -166,8 +171,8 @@ pub fn logistic(weights: &[f64], x: &[f64]) -> f64 {
     1.0 / (1.0 + (-sum).exp())
 }
 
-/// The weights with which [`logistic`] fits shares (0 to 1) best, in likelihood; a little ridge keeps them finite.
-/// Newton's method; O(rounds n d²).
+/// The weights with which [`logistic`] fits shares (0 to 1) with the largest likelihood; a small
+/// ridge keeps them finite. Newton's method; O(rounds n d²).
 pub fn fitted<const D: usize>(rows: &[([f64; D], f64)]) -> [f64; D] {
     const ROUNDS: usize = 25;
     const RIDGE: f64 = 1e-3;

@@ -1,40 +1,41 @@
-//! Maps between many shapes become a statement about each of them: whether it agrees with the others.
+//! Judges each of the maps between many shapes by its agreement with the others.
 //!
-//! Around a triangle of shapes the map by way of the third is compared with the direct one (Zach, Klopschitz and Pollefeys
-//! 2010, *Disambiguating Visual Relations Using Loop Constraints*; Huang and Guibas 2013, *Consistent Shape Maps via
-//! Semidefinite Programming*). A wrong map spoils all its triangles, a right one only those that it shares with a wrong
-//! one, so the median over its triangles tells them apart.
+//! The direct map between two shapes is compared with the map by way of a third (Zach, Klopschitz
+//! and Pollefeys 2010, *Disambiguating Visual Relations Using Loop Constraints*; Huang and Guibas
+//! 2013, *Consistent Shape Maps via Semidefinite Programming*). A wrong map spoils all its
+//! triangles, a right map only those that it shares with a wrong one, so the median over its
+//! triangles separates them.
 
 use super::basis::product;
 use super::samples::columns;
 use nalgebra::DMatrix;
 
-/// Triangles by which a map can be judged at least.
+/// The least number of triangles by which a map is judged.
 const MIN_TRIANGLES: usize = 2;
-/// Median departures beyond that of all maps by this many deviations are no chance.
+/// Median departures that exceed that of all maps by this many deviations are significant.
 const DEVIATIONS: f64 = 3.0;
 /// The median deviation of normally distributed values times this is their standard deviation.
 const OF_NORMAL: f64 = 1.4826;
-/// Departures spread at least this much, however alike those of a small collection are.
+/// The least spread of departures: those of a small collection may happen to be nearly equal.
 const LEAST_SPREAD: f64 = 0.03;
 
 /// A functional map between two shapes of a collection, by their numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Link<'a> {
-    /// Functions are carried from this shape
+    /// The shape whose functions are transferred
     pub from: usize,
-    /// to this one.
+    /// and the shape that they are transferred to.
     pub to: usize,
     /// `(k_to, k_from)`, row-major.
     pub c_12: &'a [f32],
-    /// How much it is believed.
+    /// The weight of this map.
     pub weight: f64,
 }
 
-/// A map with the numbers of the shapes that it leads from and to: `c_12 (k_to, k_from)`, row-major.
+/// A map with the numbers of its source and its target shape: `c_12 (k_to, k_from)`, row-major.
 pub type Numbered = (usize, usize, Vec<f32>);
 
-/// Maps as links that are believed alike: weight 1 each.
+/// The maps as links of equal weight 1.
 ///
 /// ```
 /// use coseg_geometry::fmap::consistency::links;
@@ -68,24 +69,24 @@ impl Link<'_> {
     }
 }
 
-/// How a map agrees with the others.
+/// The agreement of a map with the others.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Standing {
-    /// Triangles of maps that it is part of.
+    /// Number of triangles of maps that contain it.
     pub n_triangles: usize,
-    /// Median over these of how far the map by way of the third shape is from the direct one: `‖C_bc C_ab − C_ac‖` over
-    /// the mean of both norms. 0 is not at all; maps that have nothing to do with each other have about 1.4. 0 also where
-    /// there is no triangle.
+    /// Median over these triangles of the departure of the map by way of the third shape from the
+    /// direct one: `‖C_bc C_ab − C_ac‖` over the mean of both norms. 0 means equal; unrelated maps
+    /// have about 1.4. It is also 0 without triangles.
     pub departure: f64,
-    /// Whether that is more than can be expected of maps of this collection.
+    /// Whether the departure is larger than maps of this collection explain.
     pub inconsistent: bool,
 }
 
-/// Departures of all triangles `a → b → c` with `a → c`: the numbers of the three maps, and the departure.
-/// `sizes` has for each shape the rows of maps to it. O(triangles k³).
+/// Departures of all triangles `a → b → c` with `a → c`: the numbers of the three maps, and the
+/// departure. `sizes` has for each shape the number of rows of maps to it. O(triangles k³).
 ///
 /// # Panics
-/// If a map names a shape that does not exist, or has not as many entries as its shapes say.
+/// If a map names a shape that does not exist, or its number of entries does not fit its shapes.
 pub fn triangles(sizes: &[usize], links: &[Link<'_>]) -> Vec<([usize; 3], f64)> {
     let mut out_of: Vec<Vec<usize>> = vec![Vec::new(); sizes.len()];
     for (l, link) in links.iter().enumerate() {
@@ -105,16 +106,16 @@ pub fn triangles(sizes: &[usize], links: &[Link<'_>]) -> Vec<([usize; 3], f64)> 
                 let norm = |x: &mut dyn Iterator<Item = f32>| {
                     x.map(|x| f64::from(x * x)).sum::<f64>().sqrt()
                 };
-                let apart = norm(&mut round.iter().zip(direct).map(|(x, y)| x - y));
+                let departure = norm(&mut round.iter().zip(direct).map(|(x, y)| x - y));
                 let size = norm(&mut round.iter().copied()) + norm(&mut direct.iter().copied());
-                found.push(([ab, bc, ac], apart / (0.5 * size).max(1e-300)));
+                found.push(([ab, bc, ac], departure / (0.5 * size).max(1e-300)));
             }
         }
     }
     found
 }
 
-/// How each map agrees with the others.
+/// The agreement of each map with the others.
 ///
 /// # Panics
 /// As [`triangles`].
@@ -138,8 +139,8 @@ pub fn standings(sizes: &[usize], links: &[Link<'_>]) -> Vec<Standing> {
         .map(|s| s.departure)
         .collect();
     let centre = median(&mut values);
-    let mut apart: Vec<f64> = values.iter().map(|x| (x - centre).abs()).collect();
-    let spread = (OF_NORMAL * median(&mut apart)).max(LEAST_SPREAD);
+    let mut deviations: Vec<f64> = values.iter().map(|x| (x - centre).abs()).collect();
+    let spread = (OF_NORMAL * median(&mut deviations)).max(LEAST_SPREAD);
     for s in &mut standings {
         let enough = s.n_triangles >= MIN_TRIANGLES;
         s.inconsistent = enough && s.departure > centre + DEVIATIONS * spread;
@@ -152,7 +153,7 @@ pub fn leading(c_12: &[f32], stride: usize, rows: usize, columns_wanted: usize) 
     columns(&c_12[..rows * stride], stride, columns_wanted)
 }
 
-/// The median; 0 of nothing.
+/// The median; 0 for no values.
 fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     match values.len() {
@@ -174,8 +175,8 @@ pub(super) mod tests {
     pub(in super::super) const K: usize = 11;
     const N: usize = 120;
 
-    /// Closed curves that are turned against each other, with maps from each to the next few that send every vertex to one
-    /// near the right one.
+    /// Closed curves that are turned against each other, with maps from each to the next few that
+    /// send every vertex to a vertex near the right one.
     pub(in super::super) fn turned(n: usize) -> (Vec<Curve>, Vec<Numbered>) {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(7);
         let turns: Vec<usize> = (0..n).map(|_| rng.random_range(0..N)).collect();
@@ -195,7 +196,8 @@ pub(super) mod tests {
         (shapes, maps)
     }
 
-    /// Makes maps wrong: those of every eighth are of vertices in any order, or of a curve turned by a third.
+    /// Makes maps wrong: every eighth map is replaced by one between vertices in random order, or
+    /// turned by a third.
     pub(in super::super) fn spoil(shapes: &[Curve], maps: &mut [Numbered]) -> Vec<usize> {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(8);
         let wrong: Vec<usize> = (5..maps.len() - 5).step_by(8).collect();
@@ -237,7 +239,7 @@ pub(super) mod tests {
             wrong.iter().all(|m| found.contains(m)),
             "{wrong:?} {found:?}"
         );
-        // A map of which at least half of the triangles have a wrong side looks wrong too.
+        // A right map at least half of whose triangles have a wrong side also looks wrong.
         let spoilt = |m: usize| {
             let of: Vec<bool> = triangles(&sizes, &links(&maps))
                 .iter()

@@ -1,12 +1,13 @@
-//! Functional maps become pointwise maps and back.
+//! Converts functional maps to pointwise maps and back.
 //!
-//! Ovsjanikov et al. 2012, *Functional Maps*; Ezuz and Ben-Chen 2017, *Deblurring and Denoising of Maps between
-//! Shapes*. A vertex is its delta function, and two vertices are as far apart as their deltas in a spectral basis.
+//! Ovsjanikov et al. 2012, *Functional Maps*; Ezuz and Ben-Chen 2017, *Deblurring and Denoising of
+//! Maps between Shapes*. A vertex is represented by its delta function; the distance of two
+//! vertices is that of their deltas in a spectral basis.
 
 use super::basis::{Basis, product, product_transposed};
 use crate::linalg::nearest::nearest_rows;
 
-/// `c_12 (k2, k1)` of a pointwise map `p2p_21 (n2,)`: `Φ₂ᵀ A₂ Φ₁[p2p_21]`, row-major. It carries
+/// `c_12 (k2, k1)` of a pointwise map `p2p_21 (n2,)`: `Φ₂ᵀ A₂ Φ₁[p2p_21]`, row-major. It transfers
 /// coefficients on shape 1 to coefficients on shape 2. O(n2 k1 k2).
 ///
 /// ```
@@ -40,8 +41,8 @@ pub fn functional(
     two.project(&one.rows(p2p_21, k1), k1, k2)
 }
 
-/// `p2p_21 (n2,)` of a functional map `c_12 (k2, k1)`: for each row of `Φ₂` the nearest row of
-/// `Φ₁ c_12ᵀ`, as ZoomOut and pyFM take it; the lowest vertex on ties. O(n1 n2 k2).
+/// `p2p_21 (n2,)` of a functional map `c_12 (k2, k1)`: for each row of `Φ₂` the nearest row of `Φ₁
+/// c_12ᵀ`, as in ZoomOut and pyFM; the lowest vertex on ties. O(n1 n2 k2).
 ///
 /// ```
 /// use coseg_geometry::fmap::convert::pointwise;
@@ -66,8 +67,8 @@ pub fn pointwise(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize) -> V
     nearest_rows(&two.leading(k2), &targets, k2)
 }
 
-/// As [`pointwise`], by the adjoint: for each row of `Φ₂ c_12` the nearest row of `Φ₁`. Both are
-/// the same for an orthogonal map, and only then.
+/// Like [`pointwise`], by the adjoint: for each row of `Φ₂ c_12` the nearest row of `Φ₁`. The two
+/// are equal for an orthogonal map only.
 ///
 /// ```
 /// use coseg_geometry::fmap::convert::{pointwise, pointwise_adjoint};
@@ -81,7 +82,7 @@ pub fn pointwise(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize) -> V
 /// ```
 ///
 /// # Panics
-/// As [`pointwise`].
+/// Like [`pointwise`].
 pub fn pointwise_adjoint(one: &Basis<'_>, two: &Basis<'_>, c_12: &[f32], k1: usize) -> Vec<u32> {
     let k2 = c_12.len() / k1;
     let queries = product(&two.leading(k2), c_12, two.n_vertices(), k2, k1);

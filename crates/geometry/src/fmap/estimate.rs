@@ -1,10 +1,12 @@
-//! Two spectra become a map between points, without landmarks: many small starts, few of which are refined.
+//! Estimates a map between the points of two shapes from their spectra, without landmarks: it
+//! starts many small maps and refines few of them.
 //!
-//! The low eigenfunctions of similar shapes agree up to signs (and a little mixing), so every pattern of signs is a
-//! start (Ren et al. 2020, *MapTree*). Small maps do not tell the sides of a surface apart that a reflection
-//! exchanges; each start is therefore refined twice, once towards keeping orientation and once towards reversing it,
-//! by crossed functions in the nearest-neighbour search (see [`super::orientation`]). What is bijective and orthogonal
-//! is kept, on more and more samples with more and more eigenfunctions.
+//! The low eigenfunctions of similar shapes agree up to signs (and a little mixing), so every
+//! pattern of signs is a start (Ren et al. 2020, *MapTree*). Small maps do not distinguish the
+//! sides of a surface that a reflection exchanges. Each start is therefore refined twice, once
+//! towards keeping orientation and once towards reversing it, by crossed functions in the
+//! nearest-neighbour search (see [`super::orientation`]). Maps that are bijective and orthogonal
+//! survive, on more and more samples with more and more eigenfunctions.
 
 use super::basis::{Basis, product_transposed};
 use super::bijective::{Guidance, Hints, Pair, Turn};
@@ -25,42 +27,42 @@ pub struct EstimateOptions {
     pub probe_weight: f32,
     /// Weight of the crossed functions.
     pub turn_weight: f32,
-    /// Largest map that is turned.
+    /// The largest size of a map for which orientation is imposed.
     pub turn_k: usize,
-    /// What disagreement with either orientation costs, in units of strain.
+    /// Cost of disagreement with either orientation, in units of strain.
     pub orientation_cost: f64,
-    /// What a probe residual of 1 costs, in units of strain.
+    /// Cost of a probe residual of 1, in units of strain.
     pub residual_cost: f64,
     /// Scales of mean curvature among the probe functions.
     pub n_curvatures: usize,
-    /// Their weight, relative to the signatures.
+    /// Weight of the mean curvature, relative to the signatures.
     pub curvature_weight: f32,
     /// Weight of landmarks in the search, relative to the spectral coordinates.
     pub landmark_weight: f32,
-    /// Which orientation is wanted.
+    /// The orientation to prefer.
     pub side: Side,
     /// Whether the best map of the other orientation is refined to the end too.
     pub alternative: bool,
 }
 
-/// Which maps are wanted of a shape that has a reflection.
+/// The maps to return for a shape that has a reflection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Side {
-    /// Those that keep orientation, unless those that reverse it cost less by more than a quarter: what is modelled
-    /// inside out is matched all the same.
+    /// Maps that keep orientation, unless those that reverse it cost less by more than a quarter: a
+    /// shape that is modelled inside out is matched nevertheless.
     #[default]
     Preferred,
-    /// Those that keep orientation.
+    /// Maps that keep orientation.
     Keep,
-    /// Those that reverse it: the mirrored ones.
+    /// Maps that reverse orientation: the mirrored ones.
     Reverse,
 }
 
 impl Side {
-    /// How much more a map of the wanted orientation may cost.
+    /// Factor by which a map of the preferred orientation may cost more.
     const PREFERENCE: f64 = 1.25;
 
-    /// What a map counts as when maps are compared.
+    /// The cost of a map in comparisons.
     fn counted(self, candidate: &Candidate) -> f64 {
         let keeps = candidate.agreement >= 0.0;
         match self {
@@ -79,11 +81,11 @@ pub struct Stage {
     pub n_samples: usize,
     /// Size of the maps at its end.
     pub k: usize,
-    /// Growth a round.
+    /// Growth in each round.
     pub step: usize,
-    /// Maps of each orientation that are kept at its end.
+    /// Number of maps of each orientation that survive the stage.
     pub keep: usize,
-    /// Whether probe functions are searched too.
+    /// Whether the search includes probe functions.
     pub guided: bool,
 }
 
@@ -118,30 +120,30 @@ impl Default for EstimateOptions {
     }
 }
 
-/// What [`estimate`] needs of a shape, computed once for all its maps.
+/// The data of a shape that [`estimate`] uses, computed once for all its maps.
 #[derive(Debug, Clone)]
 pub struct Frame {
-    /// Samples of each stage with the basis there.
+    /// The samples of each stage, with the basis at them.
     pub levels: Vec<Level>,
-    /// Sense of orientation.
+    /// The orientation.
     pub orientation: Orientation,
 }
 
-/// A shape at one stage.
+/// The data of a shape at one stage.
 #[derive(Debug, Clone)]
 pub struct Level {
     /// The samples.
     pub samples: Samples,
-    /// The basis there.
+    /// The basis at the samples.
     pub basis: SampledBasis,
-    /// Probe functions there, of mean squared norm 1.
+    /// Probe functions at the samples, of mean squared norm 1.
     pub probes: Vec<f32>,
     /// Columns of `probes`.
     pub dim: usize,
 }
 
 impl Frame {
-    /// Of a shape.
+    /// Computes the frame of a shape.
     pub fn new(
         graph: &EdgeGraph,
         vertices: &[[f32; 3]],
@@ -169,7 +171,7 @@ impl Frame {
     /// The last, finest level.
     ///
     /// # Panics
-    /// If it was made with options that have no stage.
+    /// If the options of the frame have no stage.
     pub fn last(&self) -> &Level {
         self.levels.last().expect("invariant: there is a stage")
     }
@@ -191,7 +193,7 @@ impl Level {
 }
 
 impl Level {
-    /// With further probe functions, given at all vertices.
+    /// Adds further probe functions, given at all vertices.
     fn marked(&self, more: &Probes, weight: f32) -> Self {
         let scale = (weight / more.dim.max(1) as f32).sqrt();
         let rows = self
@@ -214,23 +216,25 @@ impl Level {
     }
 }
 
-/// A map that was found.
+/// An estimated map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
-    /// There and back.
+    /// The maps in both directions.
     pub pair: Pair,
     /// −1 (reverses orientation) to 1 (keeps it).
     pub agreement: f64,
-    /// Mean squared difference of the probe functions at matched samples, both ways; 0 is perfect, 2 is chance.
+    /// Mean squared difference of the probe functions at matched samples, in both directions; 0 is
+    /// perfect, 2 is chance.
     pub residual: f64,
     /// See [`Pair::strain`].
     pub strain: f64,
-    /// Strain plus what disagreement with orientation costs: the lower the better.
+    /// Strain plus the cost of disagreement with orientation: lower is better.
     pub cost: f64,
 }
 
-/// The best map and, if wanted, the best of the other orientation after it. `landmarks` are probe functions at the
-/// vertices of both shapes whose columns correspond (see [`super::landmarks`]).
+/// Returns the best map and, if wanted, the best map of the other orientation after it. `landmarks`
+/// are probe functions at the vertices of both shapes whose columns correspond (see
+/// [`super::landmarks`]).
 pub fn estimate(
     one: &Frame,
     two: &Frame,
@@ -273,7 +277,8 @@ pub fn estimate(
             found.iter().map(|c| (c.pair.clone(), sign(c))).collect()
         };
         let refined = tries.into_iter().map(|(pair, sign)| {
-            // Samples of a small mesh may tell fewer eigenfunctions apart than those of the stage before.
+            // Samples of a small mesh may distinguish fewer eigenfunctions than those of the
+            // previous stage.
             let pair = if pair.k > k_end {
                 pair.leading(k_end)
             } else {
@@ -320,7 +325,7 @@ pub fn estimate(
     found
 }
 
-/// The first of this orientation, then the first of the other.
+/// The first map of the preferred orientation, then the first of the other.
 fn best_of_sides(found: Vec<Candidate>, reversing: bool) -> Vec<Candidate> {
     let (same, other): (Vec<_>, Vec<_>) = found
         .into_iter()
@@ -348,7 +353,7 @@ fn probe_residual(one: &Level, two: &Level, pair: &Pair) -> f64 {
     0.5 * (mean(two, one, &p2p_21) + mean(one, two, &p2p_12))
 }
 
-/// Every pattern of signs, towards either orientation.
+/// Every pattern of signs, for either orientation.
 fn starts(n_signs: usize) -> Vec<(Pair, f32)> {
     let patterns = (0..1usize << n_signs).map(|pattern| {
         let sign = |bit: usize| if pattern >> bit & 1 == 1 { -1.0 } else { 1.0 };
@@ -369,7 +374,7 @@ fn sizes(from: usize, to: usize, step: usize) -> Vec<usize> {
 
 /// The `keep` cheapest of each orientation that differ from each other, cheapest first.
 fn best(mut found: Vec<Candidate>, keep: usize) -> Vec<Candidate> {
-    /// Mean squared difference of a row below which two maps are one.
+    /// Mean squared difference of a row below which two maps count as equal.
     const SAME: f64 = 0.05;
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     let mut kept: Vec<Candidate> = Vec::new();
@@ -387,11 +392,12 @@ fn best(mut found: Vec<Candidate>, keep: usize) -> Vec<Candidate> {
     kept
 }
 
-/// Cells of samples of shape 1 that are searched for each vertex of shape 2.
+/// Number of cells of samples of shape 1 that are searched for each vertex of shape 2.
 const N_PROBED: usize = 4;
 
-/// The pointwise map `p2p_21 (n2,)` of a functional map: for each row of `Φ₂` the nearest of `Φ₁ C₁₂ᵀ`, searched in
-/// the nearest few cells of samples of shape 1. O(n2 (samples + n1 / samples) k).
+/// The pointwise map `p2p_21 (n2,)` of a functional map: for each row of `Φ₂` the nearest of `Φ₁
+/// C₁₂ᵀ`, searched in the nearest few cells of samples of shape 1. O(n2 (samples + n1 / samples)
+/// k).
 pub fn dense(one: (&Basis<'_>, &Frame), two: &Basis<'_>, pair: &Pair) -> Vec<u32> {
     let k = pair.k;
     let targets = product_transposed(&one.0.leading(k), &pair.c_12, one.0.n_vertices(), k, k);

@@ -1,11 +1,12 @@
-//! A functional map becomes an orthogonal one that agrees with its pointwise map (Ovsjanikov et al. 2012, section 6.2).
+//! Refines a functional map to an orthogonal one that agrees with its pointwise map (Ovsjanikov et
+//! al. 2012, section 6.2).
 
 use super::basis::Basis;
 use super::convert::{functional, pointwise};
 use nalgebra::DMatrix;
 
-/// `rounds` times: pointwise map, functional map, nearest orthogonal one. `c_12 (k2, k1)`, and so
-/// the result, row-major. O(rounds n1 n2 k2).
+/// Repeats `rounds` times: pointwise map, functional map, nearest orthogonal map. `c_12 (k2, k1)`
+/// and the result are row-major. O(rounds n1 n2 k2).
 ///
 /// ```
 /// use coseg_geometry::fmap::icp::icp;
@@ -48,7 +49,7 @@ pub fn nearest_orthogonal(c: &[f32], k1: usize) -> Vec<f32> {
     let k2 = c.len() / k1.max(1);
     let svd = DMatrix::from_fn(k2, k1, |i, j| f64::from(c[i * k1 + j])).svd(true, true);
     let (Some(u), Some(v)) = (svd.u, svd.v_t) else {
-        unreachable!("invariant: both were asked for")
+        unreachable!("invariant: both factors were requested")
     };
     let product = u * v;
     product.transpose().iter().map(|x| *x as f32).collect()

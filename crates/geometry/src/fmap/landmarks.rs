@@ -1,11 +1,14 @@
-//! Points that a person matched become probe functions: heat that starts at each, as seen by every vertex.
+//! Computes probe functions from points that a person matched: the heat that starts at each, at
+//! every vertex.
 //!
-//! Ovsjanikov et al. 2012, section 5.1, with heat kernels in the place of indicator functions, which are not smooth.
+//! Ovsjanikov et al. 2012, section 5.1, with heat kernels in place of indicator functions, which
+//! are not smooth.
 
 use super::basis::{Basis, product_transposed};
 use super::probes::{Probes, standardise};
 
-/// Times of each kernel, as multiples of the time at which the largest eigenvalue in use has died out.
+/// Times of each kernel, as multiples of the time at which the heat of the largest eigenvalue in
+/// use has decayed.
 const TIMES: [f64; 3] = [2.0, 8.0, 32.0];
 /// Eigenpairs in use.
 const MAX_EIGENPAIRS: usize = 60;

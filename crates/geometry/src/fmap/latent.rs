@@ -1,16 +1,17 @@
-//! The maps of a collection become one basis that all its shapes share; what does not fit it is found, and made anew
-//! from what does.
+//! Computes one basis that all shapes of a collection share from the maps between them. It also
+//! finds maps that do not fit the basis, and replaces them by maps through it.
 //!
-//! Wang, Huang and Guibas 2013, *Image Co-Segmentation via Consistent Functional Maps*; Huang et al. 2019, *Limit Shapes*.
-//! Latent functions have coefficients `Y_i (k_i, r)` on every shape. A map agrees with them if `C_ij Y_i = Y_j`, and
-//! `Y_j Y_i⁺` is the map between any two shapes that all others agree on. A new shape joins by the weighted mean of what
-//! its maps say, and changes no other.
+//! Wang, Huang and Guibas 2013, *Image Co-Segmentation via Consistent Functional Maps*; Huang et
+//! al. 2019, *Limit Shapes*. Latent functions have coefficients `Y_i (k_i, r)` on every shape. A
+//! map agrees with them if `C_ij Y_i = Y_j`, and `Y_j Y_i⁺` is the map between any two shapes on
+//! which all others agree. A new shape joins by the weighted mean of its maps, and changes no other
+//! shape.
 
 use super::consistency::Link;
 use crate::linalg::dense_eigen::{DenseEigenError, symmetric_eigen};
 use nalgebra::{DMatrix, linalg::SVD};
 
-/// Rounds in which maps that depart lose weight, so that the mean becomes a median.
+/// Rounds in which departing maps lose weight, so that the mean approaches a median.
 const ROUNDS: usize = 6;
 /// Departures below this count as none.
 const LEAST_DEPARTURE: f64 = 0.05;
@@ -27,8 +28,8 @@ pub struct LatentBasis {
 
 impl LatentBasis {
     /// The `r` latent functions on which these maps agree best: `Σ w ‖C_ij Y_i − Y_j‖²` is least
-    /// where `Σ Y_iᵀ Y_i = n I`, with maps that depart from the rest losing weight. `eigenvalues`
-    /// has for each shape those of the eigenfunctions that the maps are between. O((Σ k)³).
+    /// where `Σ Y_iᵀ Y_i = n I`, and departing maps lose weight. `eigenvalues` has for each shape
+    /// those of its eigenfunctions. O((Σ k)³).
     ///
     /// ```
     /// use coseg_geometry::fmap::consistency::links;
@@ -46,10 +47,11 @@ impl LatentBasis {
     /// ```
     ///
     /// # Errors
-    /// The dense eigen solver did not converge.
+    /// If the dense eigensolver does not converge.
     ///
     /// # Panics
-    /// If a map names a shape that does not exist, or has not as many entries as its shapes say.
+    /// If a map names a shape that does not exist, or its number of entries does not fit its
+    /// shapes.
     pub fn solve(
         eigenvalues: &[&[f64]],
         links: &[Link<'_>],
@@ -98,17 +100,18 @@ impl LatentBasis {
         Ok(Self { r, blocks, energy })
     }
 
-    /// A further shape, by its maps from shapes that are there: `Y = Σ w_i C_i Y_i / Σ w_i`, in which maps that depart from
-    /// the others lose weight. The other shapes keep their coefficients. Its number. O(maps k² r).
+    /// Adds a shape by its maps from the shapes of the basis: `Y = Σ w_i C_i Y_i / Σ w_i`, in which
+    /// departing maps lose weight. The other shapes keep their coefficients. Returns its number.
+    /// O(maps k² r).
     ///
     /// # Panics
-    /// As [`Self::solve`]; `to` of the links is not read.
+    /// Like [`Self::solve`]; `to` of the links is ignored.
     pub fn insert(&mut self, eigenvalues: &[f64], links: &[Link<'_>]) -> usize {
         let k = eigenvalues.len();
         let mut sizes: Vec<usize> = self.blocks.iter().map(DMatrix::nrows).collect();
         sizes.push(k);
         let new = self.blocks.len();
-        let said: Vec<DMatrix<f64>> = links
+        let estimates: Vec<DMatrix<f64>> = links
             .iter()
             .map(|l| Link { to: new, ..*l }.matrix(&sizes) * &self.blocks[l.from])
             .collect();
@@ -117,10 +120,10 @@ impl LatentBasis {
         for _ in 0..ROUNDS {
             let total: f64 = weights.iter().sum();
             block = DMatrix::zeros(k, self.r);
-            for (y, weight) in said.iter().zip(&weights) {
+            for (y, weight) in estimates.iter().zip(&weights) {
                 block += y * (*weight / total.max(1e-300));
             }
-            for ((y, link), weight) in said.iter().zip(links).zip(&mut weights) {
+            for ((y, link), weight) in estimates.iter().zip(links).zip(&mut weights) {
                 let departure = (y - &block).norm() / block.norm().max(1e-300);
                 *weight = link.weight / departure.max(LEAST_DEPARTURE);
             }
@@ -130,12 +133,12 @@ impl LatentBasis {
         new
     }
 
-    /// Latent functions.
+    /// Number of latent functions.
     pub fn n_functions(&self) -> usize {
         self.r
     }
 
-    /// Shapes.
+    /// Number of shapes.
     pub fn n_shapes(&self) -> usize {
         self.blocks.len()
     }
@@ -145,11 +148,12 @@ impl LatentBasis {
         &self.blocks[shape]
     }
 
-    /// How far a map is from carrying the latent functions of the one shape to those of the other: 0 is not at all,
-    /// 1 as far as they are large.
+    /// The departure of a map from the latent functions: it compares the transferred functions of
+    /// its source with those of its target. 0 means equal, 1 a difference as large as the
+    /// functions.
     ///
     /// # Panics
-    /// As [`Self::solve`].
+    /// Like [`Self::solve`].
     pub fn departure(&self, link: &Link<'_>) -> f64 {
         let sizes: Vec<usize> = self.blocks.iter().map(DMatrix::nrows).collect();
         departure(
@@ -171,11 +175,12 @@ impl LatentBasis {
         c.transpose().iter().map(|x| *x as f32).collect()
     }
 
-    /// The rotation `(r, r)` that makes the latent functions canonical: with it, `Σ Y_iᵀ Λ_i Y_i` is diagonal and
-    /// ascending, which are its mean eigenvalues times the number of shapes. Coefficients become `Y_i U`.
+    /// The rotation `(r, r)` that makes the latent functions canonical: with it, `Σ Y_iᵀ Λ_i Y_i`
+    /// is diagonal and ascending; the diagonal is the mean eigenvalues times the number of shapes.
+    /// Coefficients become `Y_i U`.
     ///
     /// # Errors
-    /// The dense eigen solver did not converge.
+    /// If the dense eigensolver does not converge.
     pub fn canonical(&self) -> Result<(Vec<f64>, DMatrix<f64>), DenseEigenError> {
         let (values, vectors) = symmetric_eigen(self.energy.as_slice(), self.r)?;
         let u = DMatrix::from_fn(self.r, self.r, |i, j| vectors[(i, j)]);
@@ -202,7 +207,7 @@ mod tests {
     use super::super::convert::{functional, pointwise};
     use super::LatentBasis;
 
-    fn apart(a: &[f32], b: &[f32]) -> f64 {
+    fn difference(a: &[f32], b: &[f32]) -> f64 {
         let d = a.iter().zip(b).map(|(x, y)| f64::from(x - y).powi(2));
         (d.sum::<f64>() / K as f64).sqrt()
     }
@@ -214,7 +219,7 @@ mod tests {
         let wrong = spoil(&shapes, &mut maps);
         let values: Vec<&[f64]> = shapes.iter().map(|s| s.eigenvalues.as_slice()).collect();
         let all = links(&maps);
-        // Eight shapes together, the others one after the other.
+        // Eight shapes join together, the others one after the other.
         let first: Vec<Link<'_>> = all.iter().filter(|l| l.to < 8).copied().collect();
         let mut latent = LatentBasis::solve(&values[..8], &first, K).unwrap();
         let before: Vec<_> = (0..8).map(|s| latent.block(s).clone()).collect();
@@ -225,14 +230,14 @@ mod tests {
         assert!((0..8).all(|s| *latent.block(s) == before[s]));
         for (at, (i, j, c)) in right.iter().enumerate() {
             let through = latent.through(*i, *j);
-            let error = apart(&through, c);
+            let error = difference(&through, c);
             assert!(error < 0.15, "map {at}: {error}");
             if wrong.contains(&at) {
-                assert!(apart(&maps[at].2, c) > 0.8);
-                // As a start it leads to the right vertices.
+                assert!(difference(&maps[at].2, c) > 0.8);
+                // As a start of a refinement it leads to the right vertices.
                 let (a, b) = (shapes[*i].basis(), shapes[*j].basis());
                 let p2p = pointwise(&a, &b, &through, K);
-                assert!(apart(&functional(&a, &b, &p2p, K, K), c) < 0.15);
+                assert!(difference(&functional(&a, &b, &p2p, K, K), c) < 0.15);
                 assert!(latent.departure(&all[at]) > 3.0 * latent.departure(&links(&right)[at]));
             }
         }

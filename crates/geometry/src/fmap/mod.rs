@@ -1,8 +1,9 @@
-//! Functional maps: functions on one shape are carried to another in their spectral bases.
+//! Functional maps transfer functions on one shape to another in their spectral bases.
 //!
-//! Ovsjanikov et al. 2012, *Functional Maps: A Flexible Representation of Maps Between Shapes*. `c_12 (k2, k1)`
-//! carries coefficients on shape 1 to coefficients on shape 2; `p2p_21 (n2,)` gives for each vertex of 2 a
-//! vertex of 1, so that a function f on 1 is carried as `f[p2p_21]`.
+//! Ovsjanikov et al. 2012, *Functional Maps: A Flexible Representation of Maps Between Shapes*.
+//! `c_12 (k2, k1)` transfers coefficients on shape 1 to coefficients on shape 2. `p2p_21 (n2,)`
+//! gives for each vertex of 2 a vertex of 1, so that a function f on 1 is transferred as
+//! `f[p2p_21]`.
 
 pub mod basis;
 pub mod bijective;
@@ -48,8 +49,8 @@ pub struct FunctionalMap {
     pub k2: usize,
     /// For each vertex of shape 2 a vertex of shape 1.
     pub p2p_21: Vec<u32>,
-    /// What to expect of it at each vertex of shape 2, and where nothing corresponds.
+    /// Its confidence at each vertex of shape 2; it also marks vertices without counterpart.
     pub confidence: Confidence,
-    /// How good it is.
+    /// Figures of its quality.
     pub quality: Quality,
 }

@@ -1,4 +1,4 @@
-//! Functions become operators that a map shall commute with, in a spectral basis.
+//! Computes operators with which a map must commute from functions, in a spectral basis.
 
 use nalgebra::DMatrix;
 
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn crossing_is_the_jacobian() {
-        // On the unit square f = x, g = y: n · (∇f × ∇g) = 1, and its integral the area.
+        // On the unit square, f = x and g = y give n · (∇f × ∇g) = 1; its integral is the area.
         let x = [0.0, 1.0, 1.0, 0.0];
         let basis = DMatrix::from_column_slice(4, 2, &[1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0]);
         let m = crossing(&FACES, &basis, &x);

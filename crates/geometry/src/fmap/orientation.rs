@@ -1,15 +1,16 @@
-//! Whether a functional map keeps the orientation of the surface or reverses it, as a left-right mirrored one does.
+//! Decides whether a functional map keeps the orientation of the surface or reverses it, as a
+//! left-right mirrored map does.
 //!
-//! For functions f, g the function `n · (∇f × ∇g)` changes its sign with the orientation (Ren et al. 2018,
-//! *Continuous and Orientation-preserving Correspondences via Functional Maps*). On a triangle with corner values
-//! f, g its integral is half of `(f₁ − f₀)(g₂ − g₀) − (f₂ − f₀)(g₁ − g₀)`: neither lengths nor normals are needed,
-//! only that faces turn the same way.
+//! For functions f, g the function `n · (∇f × ∇g)` changes its sign with the orientation (Ren et
+//! al. 2018, *Continuous and Orientation-preserving Correspondences via Functional Maps*). On a
+//! triangle with corner values f, g its integral is half of `(f₁ − f₀)(g₂ − g₀) − (f₂ − f₀)(g₁ −
+//! g₀)`. It needs neither lengths nor normals, only consistently oriented faces.
 
 use super::basis::Basis;
 
-/// Eigenfunctions whose gradients are crossed.
+/// Number of eigenfunctions whose gradients are crossed.
 const N_CROSSED: usize = 9;
-/// Eigenfunctions in which the results are expressed.
+/// Number of eigenfunctions in which the results are expressed.
 const N_EXPRESSED: usize = 20;
 
 /// Coefficients of `n · (∇φ_i × ∇φ_j) / √(λ_i λ_j)` for pairs i < j of low eigenfunctions.
@@ -28,7 +29,8 @@ pub struct Orientation {
 }
 
 impl Orientation {
-    /// Of a shape with faces `(m, 3)` over the vertices of its basis. O(m p² q).
+    /// Computes the orientation of a shape with faces `(m, 3)` over the vertices of its basis. O(m
+    /// p² q).
     pub fn new(faces: &[[u32; 3]], basis: &Basis<'_>) -> Self {
         let k = basis.n_eigenvectors;
         let first = 1.min(k);
@@ -93,8 +95,8 @@ impl Orientation {
         )
     }
 
-    /// On `other`, the crossed functions of the eigenfunctions of this shape below `k`, carried there by `c_12`
-    /// `(rows, columns)`: `(pairs, other.q)`.
+    /// On `other`, the crossed functions of the eigenfunctions of this shape below `k`, transferred
+    /// by `c_12` `(rows, columns)`: `(pairs, other.q)`.
     fn carried_then_crossed(
         &self,
         other: &Self,
@@ -119,9 +121,9 @@ impl Orientation {
         super::basis::product(&minors, &crossed, n, there, q)
     }
 
-    /// How a map from this shape to `other` agrees with orientation, −1 (reverses) to 1 (keeps):
-    /// the cosine between crossed functions that are carried, and carried functions that are
-    /// crossed. 0 where nothing can be said. `c_12 (rows, columns)` row-major.
+    /// The agreement of a map from this shape to `other` with orientation, −1 (reverses) to 1
+    /// (keeps): the cosine between transferred crossed functions and crossed transferred functions.
+    /// 0 where neither can be decided. `c_12 (rows, columns)` is row-major.
     ///
     /// ```
     /// use coseg_geometry::fmap::orientation::Orientation;
@@ -153,9 +155,10 @@ impl Orientation {
         dot / (left * right).sqrt().max(1e-30)
     }
 
-    /// Crossed functions that correspond under `c_12 (k, k)` at samples of both shapes, `(n1, dim)`, `(n2, dim)` and
-    /// dim, of mean squared norm 1; `rows` are eigenvectors `(n, stride)` there. They tell apart what the
-    /// eigenfunctions below k alone do not: the sides of the surface that a reflection exchanges.
+    /// Crossed functions that correspond under `c_12 (k, k)` at samples of both shapes, `(n1,
+    /// dim)`, `(n2, dim)` and dim, of mean squared norm 1; `rows` are eigenvectors `(n, stride)`
+    /// there. Unlike the eigenfunctions below k, they distinguish the sides of the surface that a
+    /// reflection exchanges.
     pub fn at_samples(
         &self,
         other: &Self,

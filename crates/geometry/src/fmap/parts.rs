@@ -1,12 +1,13 @@
-//! Descriptors and spectra of two shapes become a functional map that is good for parts: ZoomOut with descriptors kept in
-//! the nearest-neighbour search.
+//! Computes a functional map that is accurate for parts from the descriptors and spectra of two
+//! shapes: ZoomOut with descriptors in the nearest-neighbour search.
 //!
-//! ZoomOut (Melzi et al. 2019, *ZoomOut: Spectral Upsampling for Efficient Shape Correspondence*) alternates a
-//! pointwise map by nearest neighbours in the spectral embedding and a larger functional map by projection. On
-//! shapes that are not isometric the spectral embedding alone drifts; with the descriptors concatenated to it
-//! parts stay on parts. The start is the nearest neighbour in descriptor space. Until the last round a few hundred vertices of
-//! each shape stand for all, and descriptors are searched by their principal components. Both shapes take the
-//! eigenfunctions below one eigenvalue, so that maps are rectangular where spectra differ.
+//! ZoomOut (Melzi et al. 2019, *ZoomOut: Spectral Upsampling for Efficient Shape Correspondence*)
+//! alternates a pointwise map by nearest neighbours in the spectral embedding and a larger
+//! functional map by projection. On shapes that are not isometric the spectral embedding alone
+//! drifts; with concatenated descriptors, parts stay on parts. The start is the nearest neighbour
+//! in descriptor space. Until the last round a few hundred vertices of each shape represent all of
+//! them, and descriptors are searched by their principal components. Both shapes use the
+//! eigenfunctions below the same eigenvalue, so that maps are rectangular where spectra differ.
 
 use super::FunctionalMap;
 use super::basis::{Basis, product, transposed_product};
@@ -17,7 +18,7 @@ use super::samples::SampledBasis;
 use crate::linalg::dense_eigen::symmetric_eigen;
 use crate::linalg::nearest::{nearest_both, nearest_rows};
 
-/// What a map needs of a shape.
+/// The data of a shape from which maps are computed.
 #[derive(Debug, Clone, Copy)]
 pub struct MapShape<'a> {
     /// Eigenvalues, ascending, at least as many as eigenvectors.
@@ -39,15 +40,16 @@ pub struct MapShape<'a> {
 /// Sizes and weights of [`descriptor_zoomout`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MapOptions {
-    /// Sizes of the maps, ascending; cut to what the shapes have. Small ones first keep the whole together.
+    /// Sizes of the maps, ascending; limited by the eigenpairs of the shapes. Small maps come first
+    /// because they keep the global structure.
     pub sizes: &'static [usize],
     /// β: mean squared norm of the descriptor block relative to the spectral block.
     pub descriptor_weight: f32,
-    /// Principal components of the descriptors that are searched.
+    /// Number of principal components of the descriptors that are searched.
     pub n_components: usize,
-    /// Vertices that stand for all of shape 2 until the last round, at least.
+    /// Least number of vertices that represent shape 2 until the last round.
     pub n_queries: usize,
-    /// Vertices that stand for all of shape 1 until the last round, at least.
+    /// Least number of vertices that represent shape 1 until the last round.
     pub n_targets: usize,
 }
 
@@ -97,7 +99,7 @@ impl<'a> MapShape<'a> {
 /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
 ///
 /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
-/// // Coordinates are descriptors that tell all points of a sphere apart.
+/// // Coordinates are descriptors that distinguish all points of a sphere.
 /// let place: Vec<f32> = sphere.mesh.vertices.as_flattened().iter().map(|x| *x as f32).collect();
 /// let (basis, faces) = (sphere.basis(), &sphere.mesh.faces);
 /// let shape = MapShape {
@@ -122,7 +124,7 @@ pub fn descriptor_zoomout(
     refined(one, two, None, options)
 }
 
-/// As [`descriptor_zoomout`], from a given map `c_12 (k, k1)`, row-major, in the place of nearest
+/// Like [`descriptor_zoomout`], from a given map `c_12 (k, k1)`, row-major, in place of nearest
 /// neighbours of descriptors.
 ///
 /// ```
@@ -162,8 +164,8 @@ pub fn descriptor_zoomout_from(
     refined(one, two, Some((c_12, k1)), options)
 }
 
-/// What a map is compared with: for each vertex of shape 2 `(n2,)` the vertex of shape 1 with the
-/// nearest descriptors, and what to expect of that, as if it were a map.
+/// The baseline of a map: for each vertex of shape 2 `(n2,)` the vertex of shape 1 with the nearest
+/// descriptors, and its confidence as if it were a map.
 ///
 /// ```
 /// use coseg_geometry::fmap::{MapShape, nearest_descriptors};
@@ -220,7 +222,7 @@ fn refined(
         rows
     };
     let weight = |k: usize| (options.descriptor_weight * k as f32 / mean_norm).sqrt();
-    // For each query the vertex of shape 1 it is matched with.
+    // For each query, the matched vertex of shape 1.
     let mut matched: Vec<u32> = match start {
         None => nearest_rows(&q2, &t1, dim),
         Some((c_12, columns)) => {
@@ -284,7 +286,7 @@ fn refined(
     }
 }
 
-/// Quality of a map, and what to expect of it at each vertex of shape 2.
+/// The quality of a map, and its confidence at each vertex of shape 2.
 fn assessed(
     one: &MapShape<'_>,
     two: &MapShape<'_>,
@@ -293,7 +295,7 @@ fn assessed(
     (p2p_21, p2p_12): (&[u32], &[u32]),
 ) -> (Quality, Confidence) {
     let row = |shape: &MapShape<'_>, v: usize| v * shape.dim..(v + 1) * shape.dim;
-    let apart = |v: usize, other: &MapShape<'_>, w: usize| -> f32 {
+    let difference = |v: usize, other: &MapShape<'_>, w: usize| -> f32 {
         let (x, y) = (
             &two.descriptors[row(two, v)],
             &other.descriptors[row(other, w)],
@@ -303,11 +305,12 @@ fn assessed(
     let matches = p2p_21.iter().enumerate();
     let residuals: Vec<f32> = matches
         .clone()
-        .map(|(v, t)| apart(v, one, *t as usize))
+        .map(|(v, t)| difference(v, one, *t as usize))
         .collect();
-    // What a vertex looks like, and what that looks like which its match is matched with: left and right look alike.
+    // The return compares the descriptors of a vertex with those of the match of its match, because
+    // left and right have similar descriptors.
     let returns: Vec<f32> = matches
-        .map(|(v, t)| apart(v, two, p2p_12[*t as usize] as usize))
+        .map(|(v, t)| difference(v, two, p2p_12[*t as usize] as usize))
         .collect();
     let mean = |values: &[f32]| {
         let sum: f64 = values
@@ -333,7 +336,8 @@ fn assessed(
     (quality, confidence)
 }
 
-/// How many eigenfunctions of each shape lie below the eigenvalue between their k-th ones; at most so many.
+/// Number of eigenfunctions of each shape below the eigenvalue between their k-th ones, limited by
+/// `most`.
 fn sizes(one: &MapShape<'_>, two: &MapShape<'_>, k: usize, most: (usize, usize)) -> (usize, usize) {
     let last = |s: &MapShape<'_>| s.eigenvalues.get(k - 1).copied().unwrap_or(f64::INFINITY);
     let limit = 0.5 * (last(one) + last(two));
@@ -344,7 +348,7 @@ fn sizes(one: &MapShape<'_>, two: &MapShape<'_>, k: usize, most: (usize, usize))
     (below(one, most.0), below(two, most.1))
 }
 
-/// At least `count` of `n` vertices (all, if there are no more), evenly over their numbers.
+/// At least `count` of `n` vertices (all, if there are no more), evenly spread over their numbers.
 fn spread(n: usize, count: usize) -> Vec<u32> {
     let step = (n / count.max(1)).max(1);
     (0..n as u32).step_by(step).collect()
@@ -361,8 +365,8 @@ fn at(x: &[f32], dim: usize, vertices: &[u32]) -> Vec<f32> {
     .collect()
 }
 
-/// The descriptors of both shapes by their common principal components, `(n1, d)`, `(n2, d)` and d; distances hardly
-/// change. As they are, if there are no more columns.
+/// The descriptors of both shapes by their common principal components, `(n1, d)`, `(n2, d)` and d;
+/// distances change little. If there are at most as many columns, they stay unchanged.
 fn components(one: &MapShape<'_>, two: &MapShape<'_>, count: usize) -> (Vec<f32>, Vec<f32>, usize) {
     let dim = one.dim;
     let whole = || (one.descriptors.to_vec(), two.descriptors.to_vec(), dim);
@@ -393,7 +397,7 @@ fn components(one: &MapShape<'_>, two: &MapShape<'_>, count: usize) -> (Vec<f32>
         .zip(gram(&b))
         .map(|(x, y)| f64::from(x + y))
         .collect();
-    // All columns give the same map as their components, only later.
+    // All columns give the same map as their components, only more slowly.
     let Ok((_, vectors)) = symmetric_eigen(&covariance, dim) else {
         return whole();
     };
@@ -414,7 +418,8 @@ mod tests {
     use rand::seq::SliceRandom;
     use rand::{Rng, SeedableRng};
 
-    /// A cycle of `n` equal vertices with its Fourier basis and a descriptor that tells vertices apart.
+    /// A cycle of `n` equal vertices with its Fourier basis and a descriptor that distinguishes
+    /// vertices.
     fn cycle(n: usize, order: &[usize]) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
         let k = 21;
         let angle = |v: usize| 2.0 * std::f32::consts::PI * order[v] as f32 / n as f32;
@@ -474,7 +479,8 @@ mod tests {
         let c = super::super::consistency::leading(&map.c_12, 21, 5, 5);
         let again = descriptor_zoomout_from(&one, &two, (&c, 5), &all);
         assert_eq!(again.p2p_21, expected);
-        // Where some vertices stand for all until the last round, neighbours on the circle are nearly ties.
+        // Where some vertices represent all until the last round, neighbours on the circle are
+        // nearly ties.
         let some = MapOptions {
             n_queries: 80,
             n_targets: 120,

@@ -1,4 +1,5 @@
-//! Two shapes become a map between their points, its mirrored alternative, and what to expect of both.
+//! Computes a map between the points of two shapes, its mirrored alternative, and the expected
+//! accuracy of both.
 
 use super::basis::Basis;
 use super::bijective::Hints;
@@ -7,11 +8,11 @@ use super::landmarks::landmark_probes;
 use super::quality::{Assessment, Quality, returned};
 use crate::mesh::{EdgeGraph, TriMesh, bridges};
 
-/// A point of shape 2 that is mapped to shape 1 and from there back comes no farther from where it was, in units of the
-/// square root of the area, if something corresponds to it.
+/// A point of shape 2 counts as matched if mapping it to shape 1 and back moves it by at most this,
+/// in units of the square root of the area.
 const FARTHEST_RETURN: f32 = 0.12;
 
-/// A shape of area 1 between whose points and those of others maps are made.
+/// A shape of area 1, prepared for maps between its points and those of others.
 #[derive(Debug, Clone)]
 pub struct PointShape<'a> {
     /// Coordinates `(n, 3)`.
@@ -24,8 +25,8 @@ pub struct PointShape<'a> {
 }
 
 impl<'a> PointShape<'a> {
-    /// Samples, probe functions and sense of orientation of a shape: the same for all its maps. The
-    /// shape has area 1 and total mass 1; its basis has as many rows as it has vertices.
+    /// Computes the samples, probe functions and orientation of a shape, which all its maps share.
+    /// The shape has area 1 and total mass 1; its basis has as many rows as it has vertices.
     pub fn new(
         vertices: &'a [[f32; 3]],
         faces: &'a [[u32; 3]],
@@ -55,7 +56,7 @@ pub struct PointMap {
     pub k: usize,
     /// For each vertex of shape 2 a vertex of shape 1.
     pub p2p_21: Vec<u32>,
-    /// For each vertex of shape 2 whether something corresponds to it.
+    /// For each vertex of shape 2 whether it has a counterpart.
     pub matched: Vec<bool>,
     /// The descriptor residual is that of the probe functions: 0 is perfect, 2 is chance.
     pub quality: Quality,
@@ -63,13 +64,14 @@ pub struct PointMap {
     pub assessment: Assessment,
     /// −1 (reverses orientation) to 1 (keeps it).
     pub orientation: f64,
-    /// Mean geodesic error to expect, in units of the square root of the area, a reflection of the whole forgiven.
+    /// Expected mean geodesic error, in units of the square root of the area; it does not count a
+    /// reflection of the whole shape.
     pub expected_error: f64,
-    /// By which maps between the same shapes compare: the lower the better.
+    /// The cost by which maps between the same shapes are compared: lower is better.
     pub cost: f64,
 }
 
-/// The map from shape 1 to shape 2 (functions), and after it, if `options` want it, the best one of
+/// The map from shape 1 to shape 2 (functions), followed, if `options` want it, by the best one of
 /// the other orientation. `landmarks` are vertices of shape 1 and of shape 2 that correspond. No
 /// start is random: the same shapes give the same maps.
 ///
@@ -134,8 +136,9 @@ fn finished(one: &PointShape<'_>, two: &PointShape<'_>, found: Candidate) -> Poi
     }
 }
 
-/// Log-linear in what a map shows of itself, fitted by least squares to 268 maps between human bodies and between
-/// cats with known correspondence; the deviation is 0.35 in the logarithm, the rank correlation 0.64.
+/// The error is log-linear in figures of the map itself, fitted by least squares to 268 maps
+/// between human bodies and between cats with known correspondence; the deviation is 0.35 in the
+/// logarithm, the rank correlation 0.64.
 fn expected_error(found: &Candidate) -> f64 {
     let log = -2.94
         + 0.214 * found.residual.max(1e-3).ln()
@@ -269,7 +272,7 @@ mod tests {
         assert!(direct < 0.02 && mirrored < 0.05, "{direct} {mirrored}");
         assert!(found[0].expected_error < 0.1 && found[0].quality.coverage > 0.8);
         assert!(found[0].assessment.round_trip < 0.05);
-        // Asked for the mirrored one, by name or by two points that only it matches.
+        // The mirrored map is requested by name, or by two points that only it matches.
         let reverse = EstimateOptions {
             side: Side::Reverse,
             alternative: false,
@@ -289,7 +292,7 @@ mod tests {
             ..EstimateOptions::default()
         };
         let (one, two) = (shape(&p, &options), shape(&p, &options));
-        // Ring 8: a quarter to the left of the bump goes to a quarter to the right.
+        // On ring 8, a quarter to the left of the bump maps to a quarter to the right.
         let ring = |j: u32| 2 + 7 * 32 + j;
         let landmarks = [
             [ring(8), ring(24)],

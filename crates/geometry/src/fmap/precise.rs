@@ -1,9 +1,9 @@
-//! A functional map becomes a map to points inside triangles (Ezuz and Ben-Chen 2017, *Deblurring and Denoising of
-//! Maps between Shapes*).
+//! Computes a map to points inside triangles from a functional map (Ezuz and Ben-Chen 2017,
+//! *Deblurring and Denoising of Maps between Shapes*).
 //!
-//! Triangles of shape 1 are triangles in the embedding too; each row of shape 2 goes to the nearest point of those
-//! around the nearest vertex, and around its neighbours. On triangles smaller than what a map of this size resolves,
-//! that is the nearest of all.
+//! Triangles of shape 1 are triangles in the embedding too. Each row of shape 2 is mapped to the
+//! nearest point of the triangles around the nearest vertex and around its neighbours. On triangles
+//! smaller than the resolution of the map, that is the nearest point of all.
 
 use super::basis::{Basis, product_transposed};
 use crate::linalg::nearest::nearest_rows;
@@ -18,8 +18,8 @@ pub struct PreciseMap {
 }
 
 impl PreciseMap {
-    /// Values `(n1, dim)` at the vertices of shape 1 with these faces become values `(n2, dim)`,
-    /// interpolated linearly inside the faces.
+    /// Interpolates values `(n1, dim)` at the vertices of shape 1 with these faces linearly inside
+    /// the faces: values `(n2, dim)` on shape 2.
     ///
     /// ```
     /// use coseg_geometry::fmap::precise::PreciseMap;
@@ -105,8 +105,9 @@ pub fn precise(
     map
 }
 
-/// Squared distance to the nearest point of a triangle in any dimension, and its barycentric coordinates (after
-/// Ericson 2005, *Real-Time Collision Detection*, section 5.1.5, which needs dot products only).
+/// Squared distance to the nearest point of a triangle in any dimension, and its barycentric
+/// coordinates (after Ericson 2005, *Real-Time Collision Detection*, section 5.1.5, which needs dot
+/// products only).
 fn nearest_in_triangle(p: &[f32], [a, b, c]: [&[f32]; 3]) -> (f32, [f32; 3]) {
     let (mut d1, mut d2, mut bb, mut bc, mut cc) = (0.0f64, 0.0f64, 0.0f64, 0.0f64, 0.0f64);
     for i in 0..p.len() {

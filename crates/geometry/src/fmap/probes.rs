@@ -1,12 +1,14 @@
-//! Functions that mean the same on every shape, from the spectrum alone: wave and heat kernel signatures.
+//! Computes functions that are comparable between all shapes from the spectrum alone: wave and heat
+//! kernel signatures.
 //!
-//! Each is centred and scaled to unit variance on its shape: what differs between classes is the level, what
-//! corresponds is where it is high and low.
+//! Each is centred and scaled to unit variance on its shape: its level depends on the class of the
+//! shape, whereas its highs and lows correspond.
 
 use super::basis::{Basis, product};
 use crate::descriptors::{hks_times, wave_weights};
 
-/// Eigenpairs that signatures are made of, so that shapes with more do not differ.
+/// Number of eigenpairs from which signatures are computed, so that shapes with more have
+/// comparable ones.
 const MAX_EIGENPAIRS: usize = 100;
 
 /// Functions at the vertices.
@@ -19,8 +21,8 @@ pub struct Probes {
 }
 
 impl Probes {
-    /// Both side by side `(n, dim + others.dim)`; the mean square of the others is `weight` times
-    /// that of these. With a weight of 0 or less the others are left out.
+    /// Places both side by side, `(n, dim + others.dim)`; the mean square of the others is `weight`
+    /// times that of these. A weight of 0 or less omits the others.
     ///
     /// ```
     /// use coseg_geometry::fmap::probes::Probes;
@@ -39,7 +41,7 @@ impl Probes {
         let values = rows
             .zip(others.values.chunks_exact(others.dim))
             .flat_map(|(a, b)| a.iter().copied().chain(b.iter().map(move |x| scale * x)));
-        // Means of squares over all columns stay 1.
+        // This factor keeps the mean square over all columns at 1.
         let norm = (dim as f32 / (self.dim as f32 * (1.0 + weight))).sqrt();
         Self {
             values: values.map(|x| norm * x).collect(),
@@ -49,8 +51,7 @@ impl Probes {
 }
 
 /// `n_energies` wave kernel and `n_times` heat kernel signatures `(n, n_energies + n_times)`, the
-/// latter as logarithms; mass-weighted mean 0 and variance 1 each. A function that is the same
-/// everywhere becomes 0.
+/// latter as logarithms; mass-weighted mean 0 and variance 1 each. A constant function becomes 0.
 ///
 /// ```
 /// use coseg_geometry::fmap::probes::probes;
@@ -93,8 +94,8 @@ pub fn probes(basis: &Basis<'_>, n_energies: usize, n_times: usize) -> Probes {
 }
 
 /// Mean curvature of the surface `vertices (n, 3)`, `faces (m, 3)`, smoothed to `n_scales` degrees
-/// `(n, n_scales)`: positive where it bulges outward, so that it tells a chest from a back, which
-/// no intrinsic function does. Mass-weighted mean 0 and variance 1 each.
+/// `(n, n_scales)`. It is positive where the surface bulges outward, so it distinguishes a chest
+/// from a back, unlike any intrinsic function. Mass-weighted mean 0 and variance 1 each.
 ///
 /// `Δx = 2 H n`, with coordinates x in the eigenbasis damped by `exp(−λ t)`.
 ///
@@ -150,7 +151,8 @@ pub fn curvature_probes(
     }
 }
 
-/// Unit normals at vertices, turned outward where the surface as a whole encloses a negative volume.
+/// Unit normals at vertices, flipped if the surface as a whole encloses a negative volume, so that
+/// they point outward.
 fn outward_normals(vertices: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[f32; 3]> {
     let mut normals = vec![[0.0f32; 3]; vertices.len()];
     let mut volume = 0.0f64;

@@ -1,42 +1,42 @@
-//! A map becomes figures that say how far it can be trusted.
+//! Computes figures of the quality of a map.
 
 use super::basis::transposed_product;
 use super::samples::Samples;
 
-/// How good a map is, as kept with it.
+/// The quality of a map, as it is stored with the map.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Quality {
     /// Mass-weighted mean squared descriptor difference between matched vertices; 0 is perfect.
     pub descriptor_residual: f64,
     /// `‖CᵀC − I‖_F / √k`; 0 for an isometry.
     pub orthogonality: f64,
-    /// Share of the mass of shape 1 that is hit, 0 to 1.
+    /// Share of the mass of shape 1 that is matched, 0 to 1.
     pub coverage: f64,
     /// Share of entries of C with magnitude below 0.1 (Yang and Tian report at least 0.9).
     pub near_zero: f64,
-    /// Of maps for parts: mass-weighted mean squared descriptor difference between a vertex of shape 2 and what its match
-    /// is matched with; 0 is perfect.
+    /// For part maps: mass-weighted mean squared descriptor difference between a vertex of shape 2
+    /// and the match of its match; 0 is perfect.
     pub descriptor_return: f64,
-    /// Of maps for parts: share of the area on which a carried label is expected to be right.
+    /// For part maps: share of the area on which a transferred label is expected to be right.
     pub confidence: f64,
-    /// Share of the mass of shape 2 to which something corresponds.
+    /// Share of the mass of shape 2 that has a counterpart.
     pub matched: f64,
 }
 
-/// What the two shapes and the map say besides, without ground truth.
+/// Further figures of the map and the two shapes, without ground truth.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Assessment {
-    /// Mean distance, in units of the square root of the area, between a sample of shape 1 and where it comes back to
-    /// when it is mapped to shape 2 and from there back.
+    /// Mean distance, in units of the square root of the area, between a sample of shape 1 and its
+    /// image after mapping it to shape 2 and back.
     pub round_trip: f64,
-    /// Dirichlet energy of the coordinates of shape 1 carried to shape 2 over that of shape 2's own: near 1 for a
-    /// smooth map, large for a torn one.
+    /// Dirichlet energy of the coordinates of shape 1 transferred to shape 2, over that of shape
+    /// 2's own coordinates: near 1 for a smooth map, large for a torn one.
     pub smoothness: f64,
 }
 
 impl Quality {
-    /// What a map `c_12 (k2, k1)` and its pointwise map `p2p_21 (n2,)` say by themselves, with the
-    /// mass `(n1,)` of shape 1; what takes descriptors stays 0.
+    /// The quality of a map `c_12 (k2, k1)` and its pointwise map `p2p_21 (n2,)`, with the mass
+    /// `(n1,)` of shape 1; figures that need descriptors stay 0.
     ///
     /// ```
     /// use coseg_geometry::fmap::Quality;
@@ -79,8 +79,8 @@ impl Quality {
 }
 
 impl Assessment {
-    /// Of a map between shapes of area 1, between whose samples the maps there and back are
-    /// `p2p_21` and `p2p_12`, and all of whose vertices are mapped by `dense_21 (n2,)`.
+    /// Assesses a map between shapes of area 1. `p2p_21` and `p2p_12` are the maps between their
+    /// samples in both directions; `dense_21 (n2,)` maps all vertices of shape 2.
     ///
     /// ```
     /// use coseg_geometry::fmap::{Assessment, samples::farthest_point_samples};
@@ -115,7 +115,8 @@ impl Assessment {
     }
 }
 
-/// How far each sample of a shape is from where it comes back to by the maps between samples there and back.
+/// The distance of each sample of a shape from its image under the maps between samples there and
+/// back.
 pub(super) fn returned(
     (vertices, samples): (&[[f32; 3]], &Samples),
     (there, back): (&[u32], &[u32]),
@@ -129,7 +130,7 @@ pub(super) fn returned(
     .collect()
 }
 
-/// Dirichlet energy of three functions on a mesh; triangles without area are left out.
+/// Dirichlet energy of three functions on a mesh; triangles without area are omitted.
 fn dirichlet(faces: &[[u32; 3]], vertices: &[[f32; 3]], value: impl Fn(u32) -> [f32; 3]) -> f64 {
     let difference =
         |a: [f32; 3], b: [f32; 3]| -> [f64; 3] { std::array::from_fn(|i| f64::from(a[i] - b[i])) };

@@ -1,13 +1,14 @@
-//! Farthest-point samples of a shape, each with the mass of its cell, stand for all vertices while a map is small.
+//! Chooses farthest-point samples of a shape, each with the mass of its cell; they represent all
+//! vertices while a map is small.
 //!
-//! Eldar et al. 1997, *The Farthest Point Strategy for Progressive Image Sampling*. Samples come in order, so the
-//! first half of them are samples too.
+//! Eldar et al. 1997, *The Farthest Point Strategy for Progressive Image Sampling*. Samples are
+//! ordered, so the first half of them are samples too.
 
 use super::basis::Basis;
 use crate::mesh::EdgeGraph;
 use crate::mesh::geodesic::Distances;
 
-/// Vertices that stand for the others.
+/// Vertices that represent the others.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Samples {
     /// In the order in which they were chosen.
@@ -19,8 +20,8 @@ pub struct Samples {
 }
 
 /// The first `count` samples (or all vertices, if there are fewer) for each of the ascending
-/// `counts`, by distance along edges, from the vertex that is farthest from the first one. Masses
-/// are those of the vertices `(n,)`, summed over cells. O(n count) in the worst case, with a small
+/// `counts`, by distance along edges, from the vertex that is farthest from vertex 0. Masses are
+/// those of the vertices `(n,)`, summed over cells. O(n count) in the worst case, with a small
 /// constant.
 ///
 /// ```
@@ -71,7 +72,7 @@ pub fn farthest_point_samples(graph: &EdgeGraph, mass: &[f32], counts: &[usize])
     found
 }
 
-/// The vertex that is farthest, unreached ones before all; the lowest on ties.
+/// The farthest vertex; unreached ones come first, and the lowest one on ties.
 fn farthest(distances: &[f64]) -> u32 {
     let mut best = (0, f64::NEG_INFINITY);
     for (v, &d) in distances.iter().enumerate() {
@@ -82,7 +83,8 @@ fn farthest(distances: &[f64]) -> u32 {
     best.0 as u32
 }
 
-/// A basis at samples, ready for projections: `C = (Φᵀ M Φ)⁻¹ Φᵀ M f` for the first k columns, any k.
+/// A basis at samples, prepared for projections: `C = (Φᵀ M Φ)⁻¹ Φᵀ M f` for the first k columns,
+/// any k.
 #[derive(Debug, Clone)]
 pub struct SampledBasis {
     /// Samples.
@@ -91,15 +93,16 @@ pub struct SampledBasis {
     pub k: usize,
     /// Eigenvectors at the samples `(n, k)`, row-major.
     pub rows: Vec<f32>,
-    /// The same times mass.
+    /// The eigenvectors times mass.
     weighted: Vec<f32>,
-    /// Lower Cholesky factor of `Φᵀ M Φ`, row-major `(k, k)`: its leading block is that of the leading block.
+    /// Lower Cholesky factor of `Φᵀ M Φ`, row-major `(k, k)`: its leading block is the factor of
+    /// the leading block.
     factor: Vec<f64>,
 }
 
 impl SampledBasis {
-    /// At the given vertices with their masses; fewer columns if there are fewer eigenvectors, or
-    /// if so few samples do not tell them apart.
+    /// Samples a basis at the given vertices with their masses. It has fewer columns if there are
+    /// fewer eigenvectors, or if the samples are too few to distinguish them.
     ///
     /// ```
     /// use coseg_geometry::fmap::samples::SampledBasis;
@@ -209,7 +212,8 @@ pub(super) fn columns(values: &[f32], stride: usize, k: usize) -> Vec<f32> {
     cut
 }
 
-/// Lower factor `(k, k)` of a symmetric matrix, row-major, and how many leading rows are positive definite.
+/// Lower factor `(k, k)` of a symmetric matrix, row-major, and the number of leading rows that are
+/// positive definite.
 fn cholesky(a: &[f32], k: usize) -> (Vec<f64>, usize) {
     const LEAST: f64 = 1e-4;
     let mut l = vec![0.0; k * k];

@@ -1,16 +1,18 @@
-//! Functions that correspond become the functional map that carries them best.
+//! Computes the functional map that best transfers corresponding functions.
 //!
-//! Minimises `w_d/2 ‖C F − G‖² + w_l/2 Σ M_ij C_ij² + w_o/2 Σ_p ‖C X_p − Y_p C‖²` with coefficients F `(k1, p)` and
-//! G `(k2, p)` of probe functions, a mask M that keeps C near the diagonal (commuting with the Laplacians, or their
-//! resolvents: Ren et al. 2019, *Structured Regularization of Functional Map Computations*), and pairs of operators
-//! that C shall commute with: multiplication by a function (Nogneng and Ovsjanikov 2017, *Informative Descriptor
+//! It minimises `w_d/2 ‖C F − G‖² + w_l/2 Σ M_ij C_ij² + w_o/2 Σ_p ‖C X_p − Y_p C‖²` with
+//! coefficients F `(k1, p)` and G `(k2, p)` of probe functions, a mask M that keeps C near the
+//! diagonal (commuting with the Laplacians, or their resolvents: Ren et al. 2019, *Structured
+//! Regularization of Functional Map Computations*), and pairs of operators with which C must
+//! commute: multiplication by a function (Nogneng and Ovsjanikov 2017, *Informative Descriptor
 //! Preservation via Commutativity*) or crossing with its gradient (Ren et al. 2018, *Continuous and
-//! Orientation-preserving Correspondences*). The first column is given: constants go to constants. Without operators
-//! the rows are independent, k2 systems of k1 unknowns; with them conjugate gradients solve for all at once.
+//! Orientation-preserving Correspondences*). The first column is given, because constants map to
+//! constants. Without operators the rows are independent, k2 systems of k1 unknowns; with operators
+//! conjugate gradients solve for all at once.
 
 use nalgebra::{DMatrix, DVector};
 
-/// The terms of the energy. Weights that are 0 and empty lists are left out.
+/// The terms of the energy. Terms with weight 0 and empty lists have no effect.
 #[derive(Debug, Clone)]
 pub struct Energy {
     /// F `(k1, p)`.
@@ -27,7 +29,7 @@ pub struct Energy {
     pub operators: Vec<(DMatrix<f64>, DMatrix<f64>, f64)>,
 }
 
-/// Why no map was found.
+/// The reason why no map was computed.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum SolveError {
     /// Neither probes nor mask determine an entry.
@@ -35,7 +37,7 @@ pub enum SolveError {
         "row {row} of the map is not determined: give more probe functions or a positive mask weight"
     )]
     Undetermined {
-        /// Of C.
+        /// Row of C.
         row: usize,
     },
     /// Conjugate gradients stopped before the residual was small.
@@ -43,11 +45,11 @@ pub enum SolveError {
         "the residual is {residual:e} of the right side after {iterations} iterations, the limit is {limit:e}"
     )]
     Slow {
-        /// Relative.
+        /// Relative residual.
         residual: f64,
-        /// Done.
+        /// Number of iterations.
         iterations: usize,
-        /// Allowed.
+        /// Largest allowed relative residual.
         limit: f64,
     },
 }
@@ -81,7 +83,7 @@ impl Energy {
     }
 
     /// The minimiser `(k2, k1)` among maps with this first column `(k2,)`. O(k2 k1³), or with
-    /// operators O(p k³) an iteration.
+    /// operators O(p k³) for each iteration.
     ///
     /// ```
     /// use coseg_geometry::fmap::solve::{Energy, laplacian_mask};
@@ -132,7 +134,7 @@ impl Energy {
         Ok(c)
     }
 
-    /// Each row on its own: exact without operators. Column 0 stays 0.
+    /// Solves each row separately, which is exact without operators. Column 0 stays 0.
     fn rows(&self, gram: &DMatrix<f64>, right: &DMatrix<f64>) -> Result<DMatrix<f64>, SolveError> {
         let (k2, k1) = self.mask.shape();
         let mut c = DMatrix::zeros(k2, k1);
@@ -147,7 +149,8 @@ impl Energy {
             }
             let b = DVector::from_fn(k1 - 1, |j, _| right[(row, j + 1)]);
             let found = system.cholesky().map(|f| f.solve(&b));
-            // With operators this is a start only, and they may determine what probes do not.
+            // With operators this is a start only, and they may determine entries that the probes
+            // leave open.
             let Some(x) = found.or_else(|| (!self.operators.is_empty()).then(|| b * 0.0)) else {
                 return Err(SolveError::Undetermined { row });
             };
@@ -169,7 +172,7 @@ impl Energy {
             m.column_mut(0).fill(0.0);
             m
         };
-        // Diagonal of the quadratic form, as preconditioner.
+        // The preconditioner is the diagonal of the quadratic form.
         let mut diagonal = DMatrix::from_fn(k2, k1, |i, j| {
             self.probe_weight * gram[(j, j)] + self.mask_weight * self.mask[(i, j)]
         });
@@ -219,8 +222,8 @@ impl Energy {
     }
 }
 
-/// `(λ_1j − λ_2i)²`, with the sum over all entries 1: `(k2, k1)`. It is 0 where the spectra agree,
-/// so that it costs a map to mix frequencies. All 0 if all eigenvalues are equal.
+/// `(λ_1j − λ_2i)²`, scaled to sum 1: `(k2, k1)`. It is 0 where the spectra agree, so that mixing
+/// frequencies costs. All 0 if all eigenvalues are equal.
 ///
 /// ```
 /// let mask = coseg_geometry::fmap::solve::laplacian_mask(&[0.0, 1.0], &[0.0, 1.0, 1.0]);

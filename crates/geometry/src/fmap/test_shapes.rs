@@ -1,4 +1,4 @@
-//! Shapes of which everything is known.
+//! Shapes with known spectra and maps.
 
 use super::basis::Basis;
 
@@ -20,7 +20,8 @@ impl Curve {
     }
 }
 
-/// `n` vertices, of which number v lies where number `v + turn` lies without turning; 11 eigenpairs.
+/// A cycle of `n` vertices with 11 eigenpairs; vertex v lies where vertex `v + turn` of the
+/// unturned cycle lies.
 pub(super) fn cycle(n: usize, turn: usize) -> Curve {
     let k = 11;
     let angle = |v: usize| 2.0 * std::f64::consts::PI * ((v + turn) % n) as f64 / n as f64;

@@ -1,9 +1,9 @@
-//! Functions and labels on one shape become those on another.
+//! Transfers functions and labels on one shape to another.
 
 use super::basis::{Basis, product};
 
-/// Values `(n1, dim)` at the vertices of shape 1 become values `(n2, dim)` at those of shape 2,
-/// vertex by vertex: `values[p2p_21]`.
+/// Transfers values `(n1, dim)` at the vertices of shape 1 to values `(n2, dim)` at those of shape
+/// 2, vertex by vertex: `values[p2p_21]`.
 ///
 /// ```
 /// use coseg_geometry::fmap::transfer::pulled_back;
@@ -22,9 +22,9 @@ pub fn pulled_back<T: Copy>(p2p_21: &[u32], values: &[T], dim: usize) -> Vec<T> 
     out
 }
 
-/// Values `(n1, dim)` carried as functions: projected onto the first `k1` eigenfunctions, mapped by
-/// `c_12 (k2, k1)`, evaluated `(n2, dim)`. Smooth, and blind to detail that the basis does not
-/// hold.
+/// Transfers values `(n1, dim)` as functions: projects them onto the first `k1` eigenfunctions,
+/// maps them by `c_12 (k2, k1)`, and evaluates the result `(n2, dim)`. The result is smooth and
+/// lacks detail that the basis does not represent.
 ///
 /// ```
 /// use coseg_geometry::fmap::transfer::carried;
@@ -55,10 +55,10 @@ pub fn carried(
     product(&two.leading(k2), &mapped, two.n_vertices(), k2, dim)
 }
 
-/// Values at faces `(m1, dim)` of shape 1, which has `n_1` vertices, become values at faces `(m2,
-/// dim)` of shape 2: of each face, the mean over its corners of the mean over the faces around the
-/// matched vertices. Labels and other classes go as indicators. `matched (n2,)` says to which
-/// vertices something corresponds; a face with fewer than two such corners gets NaN.
+/// Transfers values at faces `(m1, dim)` of shape 1, which has `n_1` vertices, to values at faces
+/// `(m2, dim)` of shape 2: for each face, the mean over its corners of the mean over the faces
+/// around the matched vertices. Labels and other classes are transferred as indicators. `matched
+/// (n2,)` marks vertices with a counterpart; a face with fewer than two such corners gets NaN.
 ///
 /// ```
 /// use coseg_geometry::fmap::transfer::faces_to_faces;
@@ -111,7 +111,7 @@ pub fn faces_to_faces(
 }
 
 /// The label of each face of shape 2 `(m2,)` that most of the faces around the vertices matched to
-/// its corners have; the lowest on ties; −1 where nothing corresponds (see [`faces_to_faces`]).
+/// its corners have; the lowest on ties; −1 without counterpart (see [`faces_to_faces`]).
 ///
 /// ```
 /// use coseg_geometry::fmap::transfer::labels_to_faces;
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn faces_take_what_is_around_the_matched_corners() {
-        // A strip of four triangles, mapped onto itself the other way round.
+        // A strip of four triangles is mapped onto itself in reverse.
         let faces = [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]];
         let p2p = [5, 4, 3, 2, 1, 0];
         let labels = [7, 7, 2, 2];
@@ -187,7 +187,7 @@ mod tests {
         let ones = [1.0, 1.0, 1.0, 1.0];
         let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[true; 6], &ones, 1);
         assert!(carried.iter().all(|x| (x - 1.0).abs() < 1e-6));
-        // Nothing corresponds to one end of the strip.
+        // One end of the strip has no counterpart.
         let matched = [false, false, true, true, true, true];
         assert_eq!(
             labels_to_faces(&faces, &faces, 6, &p2p, &matched, &labels),

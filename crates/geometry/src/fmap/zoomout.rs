@@ -1,14 +1,15 @@
-//! ZoomOut: a small map grows (Melzi et al. 2019, *ZoomOut: Spectral Upsampling for Efficient Shape Correspondence*).
+//! Enlarges a small map step by step: ZoomOut (Melzi et al. 2019, *ZoomOut: Spectral Upsampling for
+//! Efficient Shape Correspondence*).
 
 use super::basis::Basis;
 use super::convert::{functional, pointwise};
 use super::samples::{SampledBasis, columns};
 use crate::linalg::nearest::nearest_rows;
 
-/// ZoomOut as published, on all vertices: `rounds` times a pointwise map and a functional map that
-/// is larger by `step`; then the pointwise map of the last. `c_12` is `(k, k)`, row-major, and so
-/// is the result, with `k + rounds step` rows; `p2p_21 (n2,)` gives for each vertex of shape 2 a
-/// vertex of shape 1. O(rounds n1 n2 k).
+/// ZoomOut as published, on all vertices: alternates `rounds` times a pointwise map and a
+/// functional map that is larger by `step`, then computes the pointwise map of the last. `c_12` is
+/// `(k, k)`, row-major, and so is the result, with `k + rounds step` rows; `p2p_21 (n2,)` gives for
+/// each vertex of shape 2 a vertex of shape 1. O(rounds n1 n2 k).
 ///
 /// ```
 /// use coseg_geometry::fmap::zoomout;
@@ -45,8 +46,8 @@ pub fn zoomout(
     (c, p2p_21)
 }
 
-/// ZoomOut on samples, through the sizes `ks`: of `c_12 (k, k)`, a map of the last size, row-major.
-/// Functional maps are fitted by weighted least squares at the samples.
+/// ZoomOut on samples, through the sizes `ks`: grows `c_12 (k, k)` to a map of the last size,
+/// row-major. Functional maps are fitted by weighted least squares at the samples.
 ///
 /// ```
 /// use coseg_geometry::fmap::samples::{SampledBasis, farthest_point_samples};
@@ -98,7 +99,7 @@ mod tests {
         let c = functional(&a.basis(), &b.basis(), &p2p, 3, 3);
         let (large, found) = zoomout(&a.basis(), &b.basis(), &c, 3, 2, 4);
         assert_eq!((large.len(), found), (121, p2p.clone()));
-        // Samples that correspond: each third vertex of the one, and what it is matched with on the other.
+        // Corresponding samples: each third vertex of one shape, and its match on the other.
         let ids = |turn: u32| (0..50).map(|i| (3 * i + turn) % 150).collect::<Vec<u32>>();
         let mass = vec![1.0 / 50.0; 50];
         let one = SampledBasis::new(&a.basis(), &ids(23), &mass, 11);

@@ -1,4 +1,4 @@
-//! A cost matrix becomes the cheapest one-to-one assignment of rows to columns.
+//! Computes the cheapest one-to-one assignment of rows to columns of a cost matrix.
 //!
 //! Shortest augmenting paths with dual potentials (R. Jonker and A. Volgenant, "A shortest
 //! augmenting path algorithm for dense and sparse linear assignment problems", 1987), without their

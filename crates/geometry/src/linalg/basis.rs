@@ -1,9 +1,9 @@
-//! Many panels become projections and combinations of each other in few passes over memory.
+//! Projects many panels on each other and combines them, in few passes over memory.
 //!
-//! The same rows of all panels lie together (chunk-major): one pass then serves one product,
-//! whatever the number of panels. The memory is mapped for itself, in huge pages where the system
-//! has them: a basis is read from end to end hundreds of times, and walking the page tables of small
-//! pages costs a quarter of that.
+//! The same rows of all panels lie together (chunk-major), so one pass serves one product, whatever
+//! the number of panels. The basis has its own memory mapping, in huge pages where the system has
+//! them: it is read from end to end hundreds of times, and walking the page tables of small pages
+//! costs a quarter of that.
 
 use super::panel::{
     AddCombination, BURST, CHUNK, PADDING, Project, Row, SLABS, Tile, WIDTH, ZERO_TILE, add_tile,
@@ -14,7 +14,7 @@ use pulp::Arch;
 use rayon::prelude::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator};
 use rayon::slice::{ParallelSlice, ParallelSliceMut};
 
-/// Chunks whose panels stay in the second-level cache while they are combined anew.
+/// Number of chunks whose panels stay in the second-level cache while they are combined.
 const BATCH: usize = 16;
 
 /// Panels with the same number of rows, stored chunk by chunk.
@@ -32,7 +32,7 @@ fn mapped(n: usize) -> MmapMut {
     let bytes = (n * size_of::<Row>()).max(1);
     let memory = MmapMut::map_anon(bytes);
     let memory = memory.unwrap_or_else(|e| panic!("out of memory: no {bytes} bytes: {e}"));
-    // Where huge pages are not to be had, small ones do the same.
+    // Without huge pages, small ones do the same.
     #[cfg(target_os = "linux")]
     let _ = memory.advise(memmap2::Advice::HugePage);
     memory
@@ -115,7 +115,7 @@ impl Basis {
         out
     }
 
-    /// Copies panel `j` into `out`, in place of what is there.
+    /// Copies panel `j` into `out`, whose contents it replaces.
     pub fn copy_panel(&self, j: usize, out: &mut Vec<Row>) {
         out.clear();
         self.rows_of(j).for_each(|rows| out.extend_from_slice(rows));
@@ -139,7 +139,7 @@ impl Basis {
         chunks.map(move |c| &mut c[j * CHUNK..(j + 1) * CHUNK])
     }
 
-    /// A basis of the columns listed, each as (which of `sources`, its column).
+    /// A basis of the listed columns, each as (index in `sources`, column).
     pub fn of_columns(
         n: usize,
         parallel: bool,
@@ -237,8 +237,9 @@ impl Basis {
         tiles
     }
 
-    /// Replaces the panels by `X_p = Σ_j V_j C_pj`, where `coefficients[p][j]` is `C_pj`: not more
-    /// panels than there are now. In place, so that no memory is touched for the first time.
+    /// Replaces the panels by `X_p = Σ_j V_j C_pj`, where `coefficients[p][j]` is `C_pj`; there are
+    /// at most as many new panels as old ones. It works in place, so that no memory is touched for
+    /// the first time.
     pub fn transform(&mut self, coefficients: &[Vec<Tile>]) {
         let arch = Arch::new();
         let (n_in, n_out) = (self.n_panels, coefficients.len());

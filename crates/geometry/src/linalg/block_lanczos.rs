@@ -1,5 +1,5 @@
-//! A symmetric operator on panels becomes its block tridiagonal projection on a Krylov space, whose
-//! eigenpairs approximate those of largest magnitude.
+//! Projects a symmetric operator on panels to a block tridiagonal matrix on a Krylov space; the
+//! eigenpairs of the projection approximate those of largest magnitude.
 //!
 //! Block Lanczos with 8 columns and full re-orthogonalisation: no restart, no ghost copies, and
 //! every inner loop is a matrix product (Golub and Underwood 1977; Grimes, Lewis and Simon, *A
@@ -18,20 +18,20 @@ use faer::Mat;
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
-/// Below this ratio of a column's length after and before orthogonalisation it counts as lost: the
-/// Krylov space is exhausted in that direction and a random one takes its place.
+/// A column whose length after orthogonalisation is below this ratio of its length before counts as
+/// lost: the Krylov space is exhausted in that direction, and a random direction replaces it.
 const LOST: f64 = 1e-11;
 
 /// A second orthogonalisation follows when a column shrank by more than this.
 const SHRUNK: f64 = 1e-3;
 
-/// The vectors found fill the whole space: no further direction exists.
+/// The basis already spans the whole space, so no further direction exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a space of {n} dimensions has no direction beyond the {n_found} found")]
 pub struct Exhausted {
     /// Dimension of the space.
     pub n: usize,
-    /// Vectors in the basis.
+    /// Number of vectors in the basis.
     pub n_found: usize,
 }
 
@@ -39,12 +39,12 @@ pub struct Exhausted {
 pub struct BlockLanczos<'a> {
     n: usize,
     basis: Basis,
-    /// Vectors that the space stays orthogonal to.
+    /// Vectors to which the space stays orthogonal.
     locked: &'a Basis,
     /// Diagonal and subdiagonal tiles of the projection.
     diagonal: Vec<Tile>,
     subdiagonal: Vec<Tile>,
-    /// The newest block, and whether it is orthogonal to all before it but for rounding.
+    /// The newest block, and whether it is orthogonal to all earlier blocks up to rounding.
     next: Vec<Row>,
     clean: bool,
     /// Memory for the image of the newest block.
@@ -104,9 +104,9 @@ impl<'a> BlockLanczos<'a> {
 
     /// Adds one block: applies `operator` in place to a copy of the newest one.
     ///
-    /// The three-term recurrence leaves components along the older blocks that are rounding of the
-    /// operator. Every second step removes them, from the newest block and from its image at once:
-    /// one pass over the basis serves two blocks, and no block enters it before it is clean.
+    /// The three-term recurrence leaves rounding errors of the operator as components along the
+    /// older blocks. Every second step removes them, from the newest block and from its image at
+    /// once: one pass over the basis serves two blocks, and only clean blocks enter it.
     pub fn step(&mut self, operator: &dyn Fn(&mut [Row])) -> Result<(), Exhausted> {
         let mut q = std::mem::take(&mut self.next);
         let mut w = std::mem::take(&mut self.spare);
@@ -122,7 +122,7 @@ impl<'a> BlockLanczos<'a> {
         } else {
             self.locked.remove(0, [&mut q, &mut w]);
             self.basis.remove(0, [&mut q, &mut w]);
-            // What was removed from both was common to them.
+            // The parts removed from both have this common component.
             let common = gram(&q, &w, self.parallel);
             add_product(&q, &negated(&common), &mut w, self.parallel);
         }
@@ -137,8 +137,8 @@ impl<'a> BlockLanczos<'a> {
     }
 
     /// Makes the columns of `w` orthonormal among themselves (and again to the basis, if they
-    /// shrank much); returns R of `w = Q R`. Columns lost to rounding become random directions with
-    /// a zero column on the diagonal of R.
+    /// shrank much); returns R of `w = Q R`. Columns lost to rounding become random directions,
+    /// with a zero column on the diagonal of R.
     fn orthonormalise(&mut self, w: &mut [Row], scale: &[f64; WIDTH]) -> Result<Tile, Exhausted> {
         let mut total = identity();
         for pass in 0..3 {
@@ -161,7 +161,7 @@ impl<'a> BlockLanczos<'a> {
         Ok(total)
     }
 
-    /// Column by column, for blocks of deficient rank.
+    /// Orthonormalises column by column, for blocks of deficient rank.
     fn orthonormalise_slowly(
         &mut self,
         w: &mut [Row],
@@ -216,7 +216,7 @@ impl<'a> BlockLanczos<'a> {
                 self.remove_from_column(w, j);
             }
         }
-        // A last pass against everything: small remainders were scaled up.
+        // The last pass against all vectors is needed because small remainders were scaled up.
         self.locked.remove(0, [w]);
         self.basis.remove(0, [w]);
         let g = gram(w, w, self.parallel);
@@ -290,7 +290,7 @@ impl<'a> BlockLanczos<'a> {
         let m = self.dimension();
         let next = std::mem::take(&mut self.next);
         self.basis.push(&next);
-        // The columns below those of Y: of length (residual / θ), so far from 1 in the far pairs
+        // The columns below those of Y have length (residual / θ), so far from 1 in the far pairs
         // that C Cᵀ counts.
         let chosen: Vec<usize> = selected.iter().flatten().copied().collect();
         let c = Mat::from_fn(WIDTH, chosen.len(), |i, e| {

@@ -1,4 +1,4 @@
-//! A dense symmetric matrix becomes all its eigenpairs (divide and conquer, from `faer`).
+//! Computes all eigenpairs of a dense symmetric matrix (divide and conquer, from `faer`).
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};

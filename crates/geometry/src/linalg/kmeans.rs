@@ -4,9 +4,9 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64;
 
 /// Clusters the rows of `points (n, dim)`, row-major, into `k` clusters, and returns the cluster of
-/// each row `(n,)`. The best of `n_starts` seeded starts by the sum of squared distances, each
-/// times its weight `(n,)`, wins; a cluster that runs empty is restarted at the row farthest from
-/// its centre. With `k >= n` every row is its own cluster. Costs `O(n k dim)` an iteration.
+/// each row `(n,)`. Of `n_starts` seeded starts, the one with the least sum of squared distances,
+/// each times its weight `(n,)`, wins. An empty cluster is restarted at the row farthest from its
+/// centre. With `k >= n` every row is its own cluster. An iteration costs `O(n k dim)`.
 ///
 /// ```
 /// use coseg_geometry::linalg::kmeans::kmeans;

@@ -1,7 +1,8 @@
-//! The largest eigenpairs of a sparse symmetric matrix, by Lanczos with full re-orthogonalisation.
+//! Computes the largest eigenpairs of a sparse symmetric matrix by Lanczos with full
+//! re-orthogonalisation.
 //!
-//! For the affinity graphs of co-segmentation (a thousand rows, ten pairs), where only a good
-//! embedding is wanted. The Laplacian spectra that users see come from a block method with a proof of
+//! It serves the affinity graphs of co-segmentation (a thousand rows, ten pairs), which need only a
+//! good embedding. The Laplacian spectra that users see come from a block method with a proof of
 //! completeness instead.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
@@ -30,7 +31,7 @@ pub fn largest_eigenpairs(matrix: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f
     let max_steps = n.min(600);
     let mut basis: Vec<DVector<f64>> = Vec::with_capacity(max_steps);
     let (mut alpha, mut beta): (Vec<f64>, Vec<f64>) = (Vec::new(), Vec::new());
-    // A linear congruence as perturbation: no eigenvector of interest is orthogonal to it.
+    // The perturbation is a linear congruence: no eigenvector of interest is orthogonal to it.
     let mut v = DVector::from_fn(n, |i, _| {
         1.0 + 0.1 * (((i * 7919 + 13) % 1009) as f64 / 1009.0 - 0.5)
     });

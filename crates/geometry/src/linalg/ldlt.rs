@@ -1,10 +1,10 @@
-//! A sparse symmetric matrix becomes L D Lᵀ, whose pivots count eigenvalues and whose solves take a
+//! Factorises a sparse symmetric matrix as L D Lᵀ. The pivots count eigenvalues, and solves take a
 //! panel of 8 right-hand sides at a time.
 //!
 //! The fill-reducing order (approximate minimum degree), the symbolic analysis and the supernodal
 //! numeric factorisation are `faer`'s; the factor is then repacked for panel solves, which would
 //! otherwise dominate. There is no pivoting: the inertia is that of a nearby matrix, and
-//! [`Inertia::perturbation`] says how near.
+//! [`Inertia::perturbation`] bounds the distance to it.
 
 mod factor;
 mod inertia;
@@ -35,7 +35,7 @@ pub enum LdltError {
         n: usize,
         /// Stored entries.
         n_entries: usize,
-        /// What the analysis said.
+        /// The reason that the analysis reported.
         reason: String,
     },
     /// A pivot is zero or not finite: the shift is an eigenvalue of a leading block.
@@ -181,7 +181,7 @@ impl Analysis {
     }
 }
 
-/// The values of L and D, as `faer` lays them out.
+/// The values of L and D, in the layout of `faer`.
 fn factorised(
     symbolic: &SymbolicSupernodalCholesky<u32>,
     matrix: &SymmetricSparse,

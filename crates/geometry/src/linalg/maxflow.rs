@@ -1,6 +1,7 @@
-//! Minimum cuts of sparse graphs by two search trees that are kept from path to path (Boykov and Kolmogorov
-//! 2004, *An Experimental Comparison of Min-Cut/Max-Flow Algorithms*), with integer capacities: exact and
-//! deterministic. On the bands and surfaces that are cut here that is many times quicker than shortest paths.
+//! Computes minimum cuts of sparse graphs by two search trees that persist from path to path
+//! (Boykov and Kolmogorov 2004, *An Experimental Comparison of Min-Cut/Max-Flow Algorithms*), with
+//! integer capacities, hence exactly and deterministically. On the bands and surfaces of this crate
+//! it is many times faster than augmenting along shortest paths.
 
 use std::collections::VecDeque;
 
@@ -9,7 +10,8 @@ use std::collections::VecDeque;
 pub struct Network {
     /// Tail, head, capacity there and back.
     edges: Vec<(u32, u32, i64, i64)>,
-    /// What the source can still send to each node; below zero, what the node can still send to the sink.
+    /// Capacity left from the source to each node; where negative, the capacity left from the node
+    /// to the sink.
     terminal: Vec<i64>,
 }
 
@@ -41,8 +43,9 @@ impl Network {
         }
     }
 
-    /// Arcs `from → to` and `to → from` with the given capacities: what the cut costs if `from` is
-    /// on the source side and `to` on the sink side, and the other way round. A loop is left out.
+    /// Adds arcs `from → to` and `to → from` with the given capacities: the cost of a cut with
+    /// `from` on the source side and `to` on the sink side, and of the opposite cut. A loop is
+    /// ignored.
     ///
     /// # Panics
     /// If a capacity is negative.
@@ -63,7 +66,7 @@ impl Network {
     }
 
     /// Maximises the flow and returns, for each node `(n,)`, whether it is on the sink side of the
-    /// minimum cut that has the fewest nodes on the source side: a node that nothing ties to either
+    /// minimum cut with the fewest nodes on the source side. A node without a connection to either
     /// side is on the sink side.
     ///
     /// ```
@@ -91,22 +94,24 @@ struct Arc {
 
 #[derive(Debug, Clone, Copy)]
 struct Node {
-    /// The arc to the parent in its tree, or one of the three words above.
+    /// The arc to the parent in its tree, or one of the three constants above.
     parent: u32,
-    /// When its distance was last known to be right, and what it was, in arcs from the root.
+    /// The time at which its distance was last known to be right, and that distance, in arcs from
+    /// the root.
     seen: u32,
     distance: u32,
-    /// Which tree it is in, if in one.
+    /// The tree that contains the node, if any: true for the sink's.
     sink: bool,
     /// Whether it waits in `active`.
     waits: bool,
 }
 
-/// Trees grow from both ends until they touch; what a path saturates is cut off, and what hung on it is taken in
-/// elsewhere or set free.
+/// The state of the search. The trees grow from both ends until they touch. Arcs that a path
+/// saturates are cut; the subtrees behind them are attached elsewhere or set free.
 struct Search {
     nodes: Vec<Node>,
-    /// Arcs of each node, in the order in which edges were added; where each node's begin.
+    /// Arcs of each node, in the order in which edges were added, and the index of each node's
+    /// first arc.
     arcs: Vec<Arc>,
     first: Vec<u32>,
     terminal: Vec<i64>,
@@ -194,7 +199,8 @@ impl Search {
     fn run(&mut self) {
         while let Some(v) = self.active.pop_front() {
             self.nodes[v as usize].waits = false;
-            // The same node grows on as long as it is in a tree and touches the other one.
+            // The same node continues to grow as long as it is in a tree and touches the other
+            // tree.
             while self.nodes[v as usize].parent != FREE {
                 let Some(bridge) = self.grow(v) else { break };
                 self.now += 1;
@@ -209,7 +215,8 @@ impl Search {
         }
     }
 
-    /// Takes in the free neighbours of a node; an arc from the source's tree to the sink's, if there is one.
+    /// Adds the free neighbours of a node to its tree; returns an arc from the source's tree to the
+    /// sink's if there is one.
     fn grow(&mut self, v: u32) -> Option<usize> {
         let me = self.nodes[v as usize];
         for a in self.arcs_of(v) {
@@ -235,7 +242,7 @@ impl Search {
         None
     }
 
-    /// Sends what fits along the path through an arc between the trees.
+    /// Augments the flow along the path through an arc between the trees.
     fn augment(&mut self, bridge: usize) {
         let Arc {
             head: sink_end,
@@ -281,7 +288,8 @@ impl Search {
         }
     }
 
-    /// Arcs from a node to its root, or `None` if the way ends at an orphan. Distances on the way are noted.
+    /// Number of arcs from a node to its root, or `None` if the path ends at an orphan. Stores the
+    /// distances along the path.
     fn distance_to_root(&mut self, from: u32) -> Option<u32> {
         let mut v = from;
         let mut steps = 0;
@@ -312,13 +320,14 @@ impl Search {
         Some(distance)
     }
 
-    /// Hangs an orphan on the neighbour nearest to the root, or sets it free with all that hung on it.
+    /// Attaches an orphan to the neighbour nearest to the root, or frees it together with its
+    /// subtree.
     fn adopt(&mut self, v: u32) {
         let sink = self.nodes[v as usize].sink;
         let mut best: Option<(u32, usize)> = None;
         for a in self.arcs_of(v) {
             let Arc { head, back, .. } = self.arcs[a];
-            // From the neighbour to here, away from the root.
+            // The arc from the neighbour to this node, away from the root.
             if self.away(back as usize, sink) == 0 {
                 continue;
             }
@@ -416,7 +425,8 @@ mod tests {
         }
     }
 
-    /// Nodes the source does not reach after augmenting along shortest paths until there is none.
+    /// Nodes that the source does not reach after augmenting along shortest paths until none is
+    /// left.
     fn slowly(terminals: &[(i64, i64)], edges: &[(usize, usize, i64, i64)]) -> Vec<bool> {
         let n = terminals.len();
         let (s, t) = (n, n + 1);

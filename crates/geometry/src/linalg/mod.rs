@@ -1,4 +1,4 @@
-//! Numerical tools that know nothing of meshes.
+//! Numerical methods that do not depend on meshes.
 
 pub mod assignment;
 pub mod basis;

@@ -1,7 +1,7 @@
-//! Nearest rows in 20 to 200 dimensions, by blocked matrix products.
+//! Finds nearest rows in 20 to 200 dimensions by blocked matrix products.
 //!
-//! k-d trees degrade above a dozen dimensions; one GEMM per block does not, and never holds more than
-//! a block of the distance matrix.
+//! k-d trees degrade above a dozen dimensions. One GEMM per block does not, and never holds more
+//! than a block of the distance matrix.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
@@ -34,8 +34,8 @@ pub fn nearest_rows(queries: &[f32], targets: &[f32], dim: usize) -> Vec<u32> {
     nearest
 }
 
-/// As [`nearest_rows`], in both directions for the products of one: the nearest target of each
-/// query `(q,)` and the nearest query of each target `(t,)`.
+/// Like [`nearest_rows`], in both directions for the cost of one: the nearest target of each query
+/// `(q,)` and the nearest query of each target `(t,)`.
 ///
 /// ```
 /// use coseg_geometry::linalg::nearest::nearest_both;
@@ -72,9 +72,10 @@ pub fn nearest_both(queries: &[f32], targets: &[f32], dim: usize) -> (Vec<u32>, 
     (of_query, of_target)
 }
 
-/// As [`nearest_rows`], but targets are in cells `(t,)`, each with a centre that is a target, and
-/// only the `n_probed` cells with the nearest centres are searched (all, if there are no more).
-/// Near enough to exact where cells are small; costs `2 q (cells + n_probed t / cells) dim` flops.
+/// Like [`nearest_rows`], but targets are in cells `(t,)`, each with a centre that is a target, and
+/// only the `n_probed` cells with the nearest centres are searched (all, if there are no more). The
+/// result is nearly exact where cells are small; it costs `2 q (cells + n_probed t / cells) dim`
+/// flops.
 ///
 /// ```
 /// use coseg_geometry::linalg::nearest::nearest_in_cells;
@@ -152,7 +153,7 @@ pub fn nearest_in_cells(
             }
         }
     });
-    // All queries that ask for a cell are one product.
+    // All queries that probe a cell form one product.
     let mut asking = vec![Vec::new(); n_cells];
     for (at, (_, c)) in cells.iter().enumerate() {
         asking[*c as usize].push(at / n_probed);
@@ -191,8 +192,8 @@ fn half_norms(rows: &[f32], dim: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Calls `visit(query, first target, products with the targets from there)`, block by block; queries ascend within
-/// a block of targets, and the other way round.
+/// Calls `visit(query, first target, products with the targets from there)`, block by block.
+/// Queries ascend within a block of targets, and blocks of targets ascend for a query.
 fn products(
     queries: &[f32],
     targets: &[f32],
@@ -233,7 +234,7 @@ fn products(
     }
 }
 
-/// Index and value of the least `half_norm − product`; the lowest index on ties.
+/// Index and value of the least `half_norm − product`; ties go to the lowest index.
 fn least(product: &[f32], half_norms: &[f32]) -> (usize, f32) {
     // Eight independent lanes let the compiler keep the scan in vector registers.
     let mut value = [f32::INFINITY; 8];

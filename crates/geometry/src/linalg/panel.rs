@@ -1,4 +1,4 @@
-//! Tall matrices 8 columns wide become products with each other at the speed of a matrix product.
+//! Multiplies tall matrices with 8 columns at the speed of a matrix product.
 //!
 //! A *panel* is `n` rows of [`WIDTH`] numbers, row-major, padded with zero rows to a multiple of
 //! [`PADDING`]; a [`Row`] is one line of the cache.
@@ -86,8 +86,8 @@ pub fn tile_product(a: &Tile, b: &Tile) -> Tile {
     c
 }
 
-/// `VᵀW` of two panels with as many rows. `parallel`: slabs of rows are shared among the caller's
-/// rayon pool, with the same bits.
+/// `VᵀW` of two panels with equally many rows. `parallel`: slabs of rows are shared among the
+/// caller's rayon pool, with the same bits.
 ///
 /// ```
 /// use coseg_geometry::linalg::panel::{Row, gram, zero_panel};
@@ -158,7 +158,7 @@ pub fn multiply_in_place(panel: &mut [Row], tile: &Tile, parallel: bool) {
     }
 }
 
-/// Whether two vectors fit into a row; otherwise (8 numbers a vector) a row is one.
+/// Whether two vectors fit into a row; otherwise (8 numbers in a vector) a row is one vector.
 #[inline(always)]
 pub(super) fn paired<S: Simd>() -> bool {
     2 * S::F64_LANES <= WIDTH

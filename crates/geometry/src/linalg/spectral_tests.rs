@@ -1,4 +1,4 @@
-//! The parts of the eigen solver against plain loops.
+//! Compares the components of the eigensolver with plain loops.
 
 use super::basis::Basis;
 use super::dense_eigen::symmetric_eigen;
@@ -56,7 +56,7 @@ fn products_of_panels_are_those_of_plain_loops() {
         for parallel in [false, true] {
             let panels: Vec<_> = (0..3).map(|_| random_panel(n, &mut random)).collect();
             let w = random_panel(n, &mut random);
-            // Room for one panel: the others make it grow.
+            // There is room for one panel, so the others make it grow.
             let mut basis = Basis::new(n, 1, parallel);
             panels.iter().for_each(|p| basis.push(p));
             assert_eq!(basis.panel(1), panels[1]);

@@ -1,10 +1,10 @@
-//! Rows of numbers become weighted sums of their squares, at the speed of a matrix product.
+//! Computes weighted sums of squares of rows of numbers at the speed of a matrix product.
 
 use super::panel::{AddCombination, CHUNK, Row, Tile, WIDTH, ZERO_TILE};
 use pulp::Arch;
 
-/// Weights below this times the largest add nothing to a sum of squares in double precision, even where the
-/// squares differ by ten orders of magnitude.
+/// Weights below this times the largest one change no sum of squares in double precision, even
+/// where the squares differ by ten orders of magnitude.
 const NEGLIGIBLE: f64 = 1e-30;
 
 /// A matrix `(n_in, n_out)` of weights: `y_j = Σ_i weight_ij x_i²`.
@@ -12,7 +12,7 @@ const NEGLIGIBLE: f64 = 1e-30;
 pub struct SquareWeights {
     n_in: usize,
     n_out: usize,
-    /// For each 8 columns, the weights 8 rows at a time, without those at the end that are negligible.
+    /// The weights of each 8 columns, 8 rows at a time; negligible ones at the end are left out.
     groups: Vec<Vec<Tile>>,
 }
 
@@ -35,7 +35,7 @@ impl SquareWeights {
                     tiles[i / WIDTH][i % WIDTH].0[j] = weight(i, g * WIDTH + j);
                 }
             }
-            // A column at a time: their scales differ.
+            // Each column has its own limit, since their scales differ.
             let mut most = [0.0f64; WIDTH];
             for row in tiles.iter().flatten() {
                 for (m, x) in most.iter_mut().zip(&row.0) {
@@ -57,12 +57,12 @@ impl SquareWeights {
         }
     }
 
-    /// Numbers of a row that count.
+    /// Number of values of a row that count.
     pub fn n_in(&self) -> usize {
         self.n_in
     }
 
-    /// Sums of a row.
+    /// Number of sums of a row.
     pub fn n_out(&self) -> usize {
         self.n_out
     }
@@ -73,10 +73,10 @@ impl SquareWeights {
         2 * tiles * WIDTH * WIDTH
     }
 
-    /// The sums `(m, n_out)` of `rows`, m of them, each `width` numbers after the one before.
+    /// The sums `(m, n_out)` of `rows`: m rows, each `width` numbers after the previous one.
     ///
     /// # Panics
-    /// Rows are shorter than the weights, or `out` has not as many.
+    /// If rows are shorter than the weights, or `out` has a different number of rows.
     pub fn apply(&self, rows: &[f64], width: usize, out: &mut [f64]) {
         assert!(self.n_in <= width || rows.is_empty());
         if self.n_out == 0 || rows.is_empty() {
@@ -127,7 +127,7 @@ mod tests {
             (50, 100, 3, 101),
         ] {
             let rows: Vec<f64> = (0..m * width).map(|i| (i as f64 * 0.7).sin()).collect();
-            // Falls off to nothing, as exponentials do.
+            // The weights vanish quickly, as exponentials do.
             let weight = |i: usize, j: usize| (-((i * (j + 1)) as f64)).exp();
             let weights = SquareWeights::new(n_in, n_out, weight);
             let mut out = vec![f64::NAN; m * n_out];

@@ -1,4 +1,5 @@
-//! Faces of a mesh become a graph: which face borders which, how long and how sharp the border is.
+//! Builds the graph of the faces of a mesh: neighbours, and the length and angle of the edge
+//! between them.
 
 use super::{Bridge, TriMesh, add, cross, distance, dot, norm, scale, sub, unit};
 
@@ -21,7 +22,7 @@ impl EdgeFaces {
             let [a, b, c] = *face;
             [(b, c), (c, a), (a, b)].map(|(a, b)| [a.min(b), a.max(b)])
         };
-        // Sorted by the smaller vertex by counting, then by the larger.
+        // A counting sort by the smaller vertex, then a sort by the larger one.
         let mut starts = vec![0_u32; n + 1];
         for [a, _] in faces.iter().flat_map(sides) {
             starts[a as usize + 1] += 1;
@@ -29,7 +30,8 @@ impl EdgeFaces {
         for i in 1..starts.len() {
             starts[i] += starts[i - 1];
         }
-        // The larger vertex, and face and corner in one word: both in the order of what they stand for.
+        // The larger vertex, and face and corner packed into one word; words compare like the
+        // values they hold.
         let mut sorted = vec![(0_u32, 0_u64); 3 * faces.len()];
         let mut next = starts.clone();
         for (f, face) in (0_u64..).zip(faces) {
@@ -106,7 +108,7 @@ pub(crate) fn root(parent: &mut [u32], mut i: u32) -> u32 {
     i
 }
 
-/// Unites two sets under the smaller representative; false when they are one already.
+/// Unites two sets under the smaller representative; returns false if they are the same set.
 pub(crate) fn join(parent: &mut [u32], a: u32, b: u32) -> bool {
     let (a, b) = (root(parent, a), root(parent, b));
     parent[a.max(b) as usize] = a.min(b);
@@ -158,8 +160,8 @@ pub struct DualEdge {
     pub length: f64,
     /// Distance between the centroids.
     pub distance: f64,
-    /// Angle between the normals, 0 (flat) to π (folded); between faces that disagree on which side is
-    /// outside, one normal is turned over first. 0 for a bridge.
+    /// Angle between the normals, 0 (flat) to π (folded). Where two faces disagree on which side is
+    /// outside, one normal is flipped first. 0 for a bridge.
     pub angle: f64,
     /// Whether the surface bends outward here (or not at all); true for a bridge.
     pub convex: bool,
@@ -261,7 +263,7 @@ impl DualGraph {
     }
 }
 
-/// Faces around an edge, in the order in which they follow each other around it.
+/// Faces around an edge, in cyclic order.
 fn by_angle(mesh: &TriMesh, ends: [[f64; 3]; 2], faces: &[(u32, u8)]) -> Vec<(u32, u8)> {
     let axis = unit(sub(ends[1], ends[0]));
     let away = |&(f, corner): &(u32, u8)| {
@@ -274,7 +276,7 @@ fn by_angle(mesh: &TriMesh, ends: [[f64; 3]; 2], faces: &[(u32, u8)]) -> Vec<(u3
         .iter()
         .map(|face| {
             let d = away(face);
-            // The first face is at angle zero exactly, whatever rounding says.
+            // The first face has angle zero exactly, regardless of rounding.
             let angle = if face == &faces[0] {
                 0.0
             } else {
@@ -314,7 +316,7 @@ fn border(
         faces: [f, g],
         length: distance(ends[0], ends[1]),
         distance: distance(geometry.centroids[fi], geometry.centroids[gi]),
-        // More exact than the arc cosine near flat and folded.
+        // More accurate than the arc cosine near flat and folded.
         angle: norm(cross(n, m)).atan2(dot(n, m)),
         convex: dot(n, beyond) <= FLAT * norm(beyond),
         bridge: false,

@@ -1,21 +1,22 @@
-//! Components of a mesh become one domain by a spanning tree of short virtual edges.
+//! Connects the components of a mesh by a spanning tree of short virtual edges, so that they form
+//! one domain.
 //!
-//! The tree is found by Borůvka's algorithm over a k-d tree, in which a subtree that lies within one
-//! set is skipped (March, Ram and Gray 2010, *Fast Euclidean Minimum Spanning Tree*). The largest set
-//! never searches: all the others find their way to something in each round, so a body with a thousand
-//! crumbs costs a thousand short searches.
+//! The tree is found by Borůvka's algorithm over a k-d tree, in which a subtree that lies within
+//! one set is skipped (March, Ram and Gray 2010, *Fast Euclidean Minimum Spanning Tree*). The
+//! largest set never searches, since every other set finds a neighbour in each round; hence a body
+//! with a thousand crumbs costs a thousand short searches.
 
 use super::adjacency::{EdgeFaces, components, join, root};
 use super::{Bridge, TriMesh, add, distance, dot, scale, sub};
 
-/// Bridges between a pair of joined components: with one alone, everything between them would pass
-/// through a single vertex.
+/// Bridges between a pair of joined components. A single bridge would force all heat between them
+/// through one vertex.
 const MAX_PER_PAIR: usize = 3;
 /// Points in a leaf of the tree.
 const LEAF: usize = 8;
 const MIXED: u32 = u32::MAX;
 
-/// A vertex as part of a component; one that components share occurs once for each.
+/// A vertex as part of a component; a vertex that components share occurs once for each.
 #[derive(Debug, Clone, Copy)]
 struct Point {
     position: [f64; 3],
@@ -28,11 +29,11 @@ struct Node {
     high: [f64; 3],
     start: usize,
     end: usize,
-    /// Left child, the right one follows; 0 for a leaf.
+    /// Left child, which the right one follows; 0 for a leaf.
     left: usize,
 }
 
-/// Points in the order of a k-d tree, so that every node is a range.
+/// Points in the order of a k-d tree, so that each node is a range.
 struct Tree {
     points: Vec<Point>,
     nodes: Vec<Node>,
@@ -98,7 +99,7 @@ impl Tree {
         Self { points, nodes }
     }
 
-    /// For each node the set all its points are in, or `MIXED`.
+    /// For each node the set that contains all its points, or `MIXED`.
     fn sets_of_nodes(&self, set: &[u32]) -> Vec<u32> {
         let mut result = vec![MIXED; self.nodes.len()];
         // Children come after their parents.
@@ -115,8 +116,8 @@ impl Tree {
         result
     }
 
-    /// The nearest point to `position` within `limit` for which `wanted(set)` holds, by distance and
-    /// then index; `wanted` also decides on nodes of one set as a whole.
+    /// The nearest point to `position` within `limit` for which `wanted(set)` holds; ties go to the
+    /// lower index. `wanted` also decides on whole nodes whose points are in one set.
     fn nearest(
         &self,
         position: [f64; 3],
@@ -161,8 +162,9 @@ fn box_distance(node: &Node, p: [f64; 3]) -> f64 {
 }
 
 /// Virtual edges that connect all components (faces connected through shared edges); none for one
-/// component. Up to three for each pair the tree joins: the closest vertices, then others about as
-/// close but away from the first. Lengths are in units of the mesh. About O(n log n).
+/// component. There are up to three for each pair that the tree joins: the closest vertices, then
+/// others about as close but away from the first. Lengths are in units of the mesh. About O(n log
+/// n).
 ///
 /// ```
 /// use coseg_geometry::mesh::{TriMesh, bridges, icosphere};
@@ -263,7 +265,7 @@ fn spanning_tree(tree: &Tree, own: &[u32], count: usize) -> Vec<(usize, usize)> 
     pairs
 }
 
-/// The first pair, and of the candidates those farthest from all chosen so far.
+/// The first pair, and those candidates that are farthest from all chosen so far.
 fn spread(
     tree: &Tree,
     first: (usize, usize),
@@ -273,7 +275,7 @@ fn spread(
     let at = |i: usize| tree.points[i].position;
     let mut chosen = vec![first];
     while chosen.len() < MAX_PER_PAIR {
-        let apart = |&(p, _): &(usize, usize)| {
+        let from_chosen = |&(p, _): &(usize, usize)| {
             chosen
                 .iter()
                 .map(|c| distance(at(c.0), at(p)))
@@ -281,7 +283,7 @@ fn spread(
         };
         let farthest = candidates
             .iter()
-            .map(|c| (apart(c), *c))
+            .map(|c| (from_chosen(c), *c))
             .fold((0.0, first), |a, b| if b.0 > a.0 { b } else { a });
         if farthest.0 <= min_apart {
             break;
@@ -356,7 +358,7 @@ mod tests {
 
     #[test]
     fn they_are_the_shortest_and_apart() {
-        // Two sheets face to face at distance 0.5: anywhere is closest.
+        // Two sheets face each other at distance 0.5, so every point is closest.
         let mesh = zoo::union(&[
             zoo::grid(6, 6),
             zoo::moved(&zoo::grid(6, 6), [0.0, 0.0, 0.5]),

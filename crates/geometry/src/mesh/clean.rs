@@ -1,5 +1,5 @@
-//! What a file holds becomes a mesh that can be measured: welded, without degenerate or duplicate faces,
-//! coherently oriented, centred, of area 1; with a map back and a report.
+//! Turns the contents of a file into a mesh that can be measured: welded, without degenerate or
+//! duplicate faces, coherently oriented, centred, of area 1; with a map back and a report.
 
 use super::adjacency::{EdgeFaces, components};
 use super::orient::orient;
@@ -7,14 +7,14 @@ use super::{
     Bvh, CleanReport, FaceGeometry, ParsedMesh, Search, TriMesh, add, cross, norm, scale, sub,
 };
 
-/// A triangle lower than this fraction of its longest edge has no area: a few units in the last place
-/// of coordinates of the size of the edge.
+/// A triangle lower than this fraction of its longest edge counts as having no area: the fraction
+/// is a few units in the last place of coordinates of the size of the edge.
 const MIN_HEIGHT: f64 = 1e-12;
 /// Spans within which squares of coordinates neither overflow nor vanish.
 const MIN_SPAN: f64 = 1e-140;
 const MAX_SPAN: f64 = 1e140;
 
-/// Why a file's triangles are no surface.
+/// The reason why the triangles of a file form no surface.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[allow(missing_docs)] // the fields are the values of the message
 pub enum CleanError {
@@ -26,7 +26,7 @@ pub enum CleanError {
     Span { span: f64 },
 }
 
-/// A mesh that can be measured, and how it came from the parsed one.
+/// A mesh that can be measured, with the maps from the parsed mesh to it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Cleaned {
     /// Centred at its area centroid, total area 1, every vertex used, every face with an area.
@@ -45,7 +45,7 @@ pub struct Cleaned {
     pub face_of_polygon: Vec<u32>,
     /// For each polygon its share of the area of all polygons, `(n_polygons,)`; sums to 1.
     pub polygon_area: Vec<f64>,
-    /// What was found and done; what concerns the proxy is 0.
+    /// The findings of cleaning; counts of the proxy are 0.
     pub report: CleanReport,
 }
 
@@ -53,8 +53,8 @@ pub struct Cleaned {
 ///
 /// Vertices at exactly equal positions become one. Degenerate triangles (two corners equal, or no
 /// height) and repeated ones (the same three corners in any order: the first stays) are dropped;
-/// each is mapped to the nearest face that stays. Neighbouring faces are made to agree about the
-/// outside.
+/// each is mapped to the nearest face that stays. Neighbouring faces are reoriented until they
+/// agree about the outside.
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, clean, parse};
@@ -71,8 +71,8 @@ pub struct Cleaned {
 /// ```
 ///
 /// # Errors
-/// When no triangle has any area, or coordinates are too large or too close for their squares to be
-/// numbers.
+/// If no triangle has any area, or coordinates are too large or too close for their squares to be
+/// finite and positive.
 pub fn clean(parsed: &ParsedMesh) -> Result<Cleaned, CleanError> {
     let used = used_vertices(parsed);
     let (low, high) = bounds(parsed, &used);
@@ -84,8 +84,8 @@ pub fn clean(parsed: &ParsedMesh) -> Result<Cleaned, CleanError> {
     if !(MIN_SPAN..=MAX_SPAN).contains(&span) {
         return Err(CleanError::Span { span });
     }
-    // Measured in the unit box about the origin: a mesh far away loses nothing, and no product of
-    // coordinates overflows.
+    // The mesh is measured in the unit box about the origin: a mesh far away loses no digits, and
+    // no product of coordinates overflows.
     let middle: [f64; 3] = std::array::from_fn(|i| low[i] + 0.5 * (high[i] - low[i]));
     let local: Vec<[f64; 3]> = parsed
         .vertices
@@ -156,8 +156,8 @@ pub fn clean(parsed: &ParsedMesh) -> Result<Cleaned, CleanError> {
     })
 }
 
-/// Moves a mesh to its area centroid and scales it to area 1; returns what its area, its centroid and
-/// the factor were. The area must not be 0.
+/// Moves a mesh to its area centroid and scales it to area 1; returns its original area, its
+/// centroid and the factor. The area must not be 0.
 pub(super) fn normalize(mesh: &mut TriMesh) -> (f64, [f64; 3], f64) {
     let geometry = FaceGeometry::new(mesh);
     let area: f64 = geometry.areas.iter().sum();
@@ -178,7 +178,7 @@ pub(super) fn is_degenerate([a, b, c]: [[f64; 3]; 3], min_height: f64) -> bool {
     let edges = [sub(b, a), sub(c, b), sub(a, c)];
     let longest = edges.iter().map(|&e| norm(e)).fold(0.0, f64::max);
     let doubled = norm(cross(edges[0], edges[1]));
-    // Written so that an overflow or a NaN counts as degenerate.
+    // An overflow or a NaN makes this condition true, so it counts as degenerate.
     !(doubled > min_height * longest * longest && doubled.is_finite())
 }
 
@@ -201,10 +201,10 @@ fn bounds(parsed: &ParsedMesh, used: &[bool]) -> ([f64; 3], [f64; 3]) {
 
 /// For each used vertex the first one at its position, and the number of positions.
 fn weld(parsed: &ParsedMesh, used: &[bool]) -> (Vec<u32>, usize) {
-    // Adding zero makes -0 and 0 one.
+    // Adding zero makes -0 and 0 equal.
     let key = |v: u32| parsed.vertices[v as usize].map(|x| (x + 0.0).to_bits());
     let mut weld: Vec<u32> = (0..used.len() as u32).collect();
-    // Words that are sorted quickly: what stands for a position, then the vertex.
+    // These words sort fast: a hash of the position, then the vertex.
     let mut order: Vec<u128> = (0..used.len() as u32)
         .filter(|&v| used[v as usize])
         .map(|v| u128::from(mixed(key(v))) << 32 | u128::from(v))
@@ -227,9 +227,10 @@ fn weld(parsed: &ParsedMesh, used: &[bool]) -> (Vec<u32>, usize) {
     (weld, n_distinct)
 }
 
-/// A word that is the same for equal positions, and hardly ever for others.
+/// A hash that is equal for equal positions, and hardly ever for different ones.
 fn mixed(position: [u64; 3]) -> u64 {
-    // Odd, and half of the bits of 2^64 over the golden ratio, as in Fibonacci hashing.
+    // An odd number with half of its bits set, near 2^64 over the golden ratio, as in Fibonacci
+    // hashing.
     const FACTOR: u64 = 0x9e37_79b9_7f4a_7c15;
     position.iter().fold(0, |word: u64, x| {
         (word.rotate_left(29) ^ x)
@@ -243,7 +244,7 @@ fn area(vertices: &[[f64; 3]], triangle: [u32; 3]) -> f64 {
     0.5 * norm(cross(sub(b, a), sub(c, a)))
 }
 
-/// Three corners in any order as one word of 96 bits.
+/// Three corners in any order, packed into a word of 96 bits.
 pub(super) fn corner_word(mut corners: [u32; 3]) -> u128 {
     corners.sort_unstable();
     corners
@@ -251,7 +252,7 @@ pub(super) fn corner_word(mut corners: [u32; 3]) -> u128 {
         .fold(0, |word, &v| word << 32 | u128::from(v))
 }
 
-/// Triangles that stay, and for each triangle the face it stays as or is a repetition of.
+/// Triangles that stay, and for each triangle its face or the face that it repeats.
 fn keep(
     parsed: &ParsedMesh,
     local: &[[f64; 3]],
@@ -259,7 +260,7 @@ fn keep(
     report: &mut CleanReport,
 ) -> (Vec<u32>, Vec<Option<u32>>) {
     let n = parsed.triangles.len();
-    // Three corners and the triangle in one word, which sorts faster than a tuple.
+    // Three corners and the triangle packed into one word, which sorts faster than a tuple.
     let mut sound: Vec<u128> = Vec::with_capacity(n);
     for (t, triangle) in parsed.triangles.iter().enumerate() {
         let corners = triangle.map(|v| weld[v as usize]);
@@ -497,7 +498,7 @@ mod tests {
             let cleaned = clean(&zoo::parsed(&moved)).unwrap();
             assert!((cleaned.area / (one.area * factor * factor) - 1.0).abs() < 1e-8);
             for (a, b) in cleaned.mesh.vertices.iter().zip(&one.mesh.vertices) {
-                // A million times the size away, doubles leave nine digits.
+                // At a distance of a million times the size, doubles leave nine digits.
                 assert!(distance(*a, *b) < 1e-8, "{a:?} {b:?}");
             }
         }

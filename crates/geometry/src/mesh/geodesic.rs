@@ -1,4 +1,4 @@
-//! Shortest paths along the edges of a mesh, by Dijkstra's algorithm.
+//! Computes shortest paths along the edges of a mesh by Dijkstra's algorithm.
 //!
 //! Edge paths overestimate true geodesics by up to a fifth on regular meshes. The descriptors compare
 //! distances with each other within one mesh, where that cancels.
@@ -10,7 +10,7 @@ use std::collections::BinaryHeap;
 
 /// Width of a bucket, in mean edges.
 const BUCKET: f64 = 0.5;
-/// Buckets at most: one edge may be very much longer than the mean.
+/// The largest number of buckets: one edge may be much longer than the mean.
 const MAX_BUCKETS: f64 = 1000.0;
 
 /// Vertices and edges of a mesh with their lengths, and the bridges between its components.
@@ -18,26 +18,26 @@ const MAX_BUCKETS: f64 = 1000.0;
 pub struct EdgeGraph {
     offsets: Vec<u32>,
     neighbors: Vec<(u32, f64)>,
-    /// Of the buckets by which a search from one vertex advances.
+    /// Width of the buckets by which a search from one vertex advances.
     width: f64,
     n_buckets: usize,
 }
 
-/// Distances from one source, and the memory that finding them takes; reusable for the next source.
+/// Distances from one source, with the memory of the search; reusable for the next source.
 #[derive(Debug, Clone, Default)]
 pub struct Distances {
     /// Distance of each node; infinite where there is no path.
     pub values: Vec<f64>,
-    /// Non-negative doubles are ordered like their bits.
+    /// Non-negative doubles have the same order as their bits.
     heap: BinaryHeap<Reverse<(u64, u32)>>,
     /// Nodes to be visited, by distance.
     buckets: Vec<Vec<u32>>,
-    /// Distance with which each node was last visited.
+    /// The distance at which each node was last visited.
     visited: Vec<f64>,
 }
 
 impl Distances {
-    /// Forgets everything: all nodes are infinitely far.
+    /// Sets the distances of all nodes to infinity.
     pub fn reset(&mut self, n_nodes: usize) {
         self.values.clear();
         self.values.resize(n_nodes, f64::INFINITY);
@@ -45,8 +45,8 @@ impl Distances {
     }
 
     /// Lowers `values` by paths from `source`, over edges that `neighbors` lists with their
-    /// non-negative costs; calls `reached` for each node that got nearer. Nodes that have a shorter
-    /// distance already keep it, and nothing is searched beyond them.
+    /// non-negative costs; calls `reached` for each node whose distance falls. Nodes that already
+    /// have a shorter distance keep it, and the search stops at them.
     ///
     /// ```
     /// use coseg_geometry::mesh::geodesic::Distances;
@@ -134,7 +134,8 @@ impl EdgeGraph {
             offsets,
             neighbors,
             width,
-            // What waits is within the longest edge of what is visited; the rest is for rounding.
+            // Waiting nodes are within the longest edge of the visited ones; the other buckets
+            // allow for rounding.
             n_buckets: ((longest / width) as usize + 3).next_power_of_two(),
         }
     }
@@ -169,11 +170,11 @@ impl EdgeGraph {
         distances.values
     }
 
-    /// As [`Self::dijkstra`], into memory that is used again.
+    /// Like [`Self::dijkstra`], into memory that is reused.
     ///
-    /// By buckets in the place of a heap (Meyer and Sanders 2003, *Δ-stepping*): the few vertices
-    /// that are visited twice cost less than keeping an order. The distances are the same bits,
-    /// because sums along a path do not depend on when they are made.
+    /// It uses buckets in place of a heap (Meyer and Sanders 2003, *Δ-stepping*): visiting a few
+    /// vertices twice costs less than maintaining an order. The distances are the same bits,
+    /// because sums along a path do not depend on the order of visits.
     ///
     /// ```
     /// use coseg_geometry::mesh::{EdgeGraph, geodesic::Distances, icosphere};

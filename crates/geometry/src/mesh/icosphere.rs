@@ -1,10 +1,10 @@
-//! The sphere that examples and tests share.
+//! Generates the sphere that examples and tests share.
 
 use super::{TriMesh, add, unit};
 use std::collections::BTreeMap;
 
-/// A sphere of radius 1 with `10 · 4^levels + 2` vertices: an icosahedron, each face split in four
-/// `levels` times.
+/// A sphere of radius 1 with `10 · 4^levels + 2` vertices: an icosahedron whose faces are split in
+/// four `levels` times.
 ///
 /// ```
 /// let sphere = coseg_geometry::mesh::icosphere(2);

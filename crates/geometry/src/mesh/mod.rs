@@ -1,8 +1,8 @@
-//! Bytes of a mesh file become a clean, normalised triangle mesh at working resolution.
+//! Turns the bytes of a mesh file into a clean, normalised triangle mesh at working resolution.
 //!
-//! [`parse`] reads what the file says, [`clean`] makes it a mesh that can be measured and reports what
-//! it did, [`proxy`] brings it to working resolution with a map back, [`bridges`] joins its components,
-//! and [`adjacency`] and [`geodesic`] hold the graphs that everything later walks on.
+//! [`parse`] reads the file, [`clean`] makes it a mesh that can be measured and reports the
+//! defects, [`proxy`] brings it to working resolution with a map back, [`bridges`] joins its
+//! components, and [`adjacency`] and [`geodesic`] hold the graphs that later stages use.
 
 pub mod adjacency;
 mod bridges;
@@ -77,14 +77,14 @@ pub enum Format {
 }
 
 impl Format {
-    /// All of them.
+    /// All supported formats.
     pub const ALL: [Self; 5] = [Self::Obj, Self::Off, Self::Ply, Self::Stl, Self::Gltf];
 
     /// Extensions of file names, as messages list them.
     pub const EXTENSIONS: &str = ".obj, .off, .ply, .stl, .glb, .gltf";
 
-    /// The format that the extension of a file name stands for, in upper or lower case; `None` for
-    /// any other extension. Text and binary forms share a format: [`parse`] tells them apart.
+    /// The format of an extension of a file name, in upper or lower case; `None` for any other
+    /// extension. Text and binary forms share a format: [`parse`] distinguishes them.
     ///
     /// ```
     /// use coseg_geometry::mesh::Format;
@@ -107,7 +107,7 @@ impl Format {
         }
     }
 
-    /// Its name in lower case.
+    /// The name of the format in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Self::Obj => "obj",
@@ -119,24 +119,24 @@ impl Format {
     }
 }
 
-/// What a file holds: its polygons as triangles, in file order.
+/// The contents of a file: its polygons as triangles, in file order.
 ///
-/// Every polygon has at least one triangle: a face with one or two corners becomes a degenerate one, so
-/// that polygons keep their numbers.
+/// Every polygon has at least one triangle: a face with one or two corners becomes a degenerate
+/// one, so that polygons keep their numbers.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ParsedMesh {
     /// Coordinates as in the file, in file order.
     pub vertices: Vec<[f64; 3]>,
     /// Triangles, as vertex indices that are all in range.
     pub triangles: Vec<[u32; 3]>,
-    /// For each triangle the polygon of the file (0-based, file order) it came from.
+    /// For each triangle its polygon in the file (0-based, file order).
     pub polygon_of_triangle: Vec<u32>,
     /// Number of polygons (faces) in the file.
     pub n_polygons: usize,
-    /// Corners of each polygon whose triangles are not its fan from the first corner, by polygon,
-    /// ascending.
+    /// Polygons, ascending, whose triangles are not their fan from the first corner, with their
+    /// corners.
     pub not_fans: Vec<(u32, Vec<u32>)>,
-    /// What reading found.
+    /// The findings of reading.
     pub findings: Findings,
 }
 
@@ -167,16 +167,16 @@ impl ParsedMesh {
     }
 }
 
-/// What reading a file found and did; all 0 for most files.
+/// The findings of reading a file; all are 0 for most files.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Findings {
     /// Polygons whose corners do not lie in a plane.
     pub n_nonplanar_polygons: usize,
     /// Polygons that cross themselves or have no area.
     pub n_nonsimple_polygons: usize,
-    /// Statements that were read although programs differ about them.
+    /// Statements that were read although programs interpret them differently.
     pub n_tolerated_statements: usize,
-    /// Statements that hold geometry other than polygons, or that are unknown; they were not read.
+    /// Statements that were skipped: they hold geometry other than polygons, or are unknown.
     pub n_unread_statements: usize,
 }
 
@@ -191,24 +191,24 @@ pub struct Bridge {
     pub length: f64,
 }
 
-/// What cleaning found and did; counts are of the triangulated input.
+/// The findings and actions of cleaning; counts are of the triangulated input.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CleanReport {
-    /// Polygons, triangles and vertices of the input.
+    /// Polygons of the input.
     pub n_polygons: usize,
-    /// Triangles that the polygons became.
+    /// Triangles of the triangulated polygons.
     pub n_triangles: usize,
     /// Vertices in the file.
     pub n_vertices: usize,
     /// Vertices at exactly equal positions that were welded into others.
     pub n_welded_vertices: usize,
-    /// Vertices no face uses.
+    /// Vertices without a face.
     pub n_isolated_vertices: usize,
     /// Triangles dropped because two corners coincide or the area is zero.
     pub n_degenerate_triangles: usize,
     /// Triangles dropped because another one has the same three corners.
     pub n_duplicate_triangles: usize,
-    /// Triangles turned over, so that neighbours agree on which side is outside.
+    /// Triangles that were flipped, so that neighbours agree on which side is outside.
     pub n_flipped_triangles: usize,
     /// Edges with more than two faces.
     pub n_nonmanifold_edges: usize,
@@ -220,7 +220,7 @@ pub struct CleanReport {
     pub n_proxy_faces: usize,
     /// Vertices of the proxy.
     pub n_proxy_vertices: usize,
-    /// Bridges put between components of what is analysed.
+    /// Bridges between components of the analysed mesh.
     pub n_bridges: usize,
     /// Polygons whose triangles are not their fan from the first corner: concave ones, and those
     /// with holes.
@@ -229,12 +229,13 @@ pub struct CleanReport {
     pub n_nonplanar_polygons: usize,
     /// Polygons that cross themselves or have no area; their triangles are their fan.
     pub n_nonsimple_polygons: usize,
-    /// Statements that were read although programs differ about them.
+    /// Statements that were read although programs interpret them differently.
     pub n_tolerated_statements: usize,
-    /// Statements that hold geometry other than polygons, or that are unknown; they were not read.
+    /// Statements that were skipped: they hold geometry other than polygons, or are unknown.
     pub n_unread_statements: usize,
-    /// Components that are left out of the analysis: another one at a small distance stands for each.
+    /// Components that are excluded from the analysis: another one at a small distance represents
+    /// each.
     pub n_inner_walls: usize,
-    /// Triangles of these.
+    /// Triangles of these components.
     pub n_inner_triangles: usize,
 }

@@ -1,14 +1,14 @@
-//! Faces that disagree with their neighbours about which side is outside are turned over.
+//! Flips faces that disagree with their neighbours about which side is outside.
 //!
-//! Rays cast inward and the sign of a crease need the outside. Coherence spreads over edges with two
-//! faces; of the two coherent orientations the one that turns fewer faces is taken, then a closed
-//! component with negative volume is turned as a whole. A component within the box of another closed
-//! one may be its cavity, whose outside is inward, and is only made coherent.
+//! Rays cast inward and the sign of a crease need the outside. Coherence spreads over edges with
+//! two faces; of the two coherent orientations the one that flips fewer faces is taken. Then a
+//! closed component with negative volume is flipped as a whole. A component within the box of
+//! another closed one may be its cavity, whose outside is inward, and is only made coherent.
 
 use super::adjacency::{EdgeFaces, ascends};
 use super::{TriMesh, cross, dot, norm, sub};
 
-/// Volumes below this fraction of area^1.5 are flat: they have no inside. A sphere has 0.09.
+/// Volumes below this fraction of area^1.5 are flat and have no inside. A sphere has 0.09.
 const MIN_VOLUME: f64 = 1e-6;
 
 struct Piece {
@@ -19,7 +19,7 @@ struct Piece {
     high: [f64; 3],
 }
 
-/// Turns faces over in place and says how many.
+/// Flips faces in place and returns their number.
 pub(super) fn orient(mesh: &mut TriMesh, edges: &EdgeFaces) -> usize {
     let n = mesh.faces.len();
     let mut edges_of = vec![[0_u32; 3]; n];

@@ -1,30 +1,33 @@
-//! A clean mesh becomes one of working resolution, on which everything is computed, and a map back.
+//! Computes a mesh of working resolution from a clean mesh, with a map back. All later stages use
+//! this proxy.
 //!
-//! Finer meshes are simplified by quadric edge collapse (Garland and Heckbert 1997, by meshopt, whose
-//! regularisation keeps angles usable for cotangents); coarser ones, and huge faces, are cut. Vertices
-//! are rounded to single precision, in which they are stored, so that what is computed from a fresh
-//! proxy and from a stored one is the same.
+//! Finer meshes are simplified by quadric edge collapse (Garland and Heckbert 1997, by meshopt,
+//! whose regularisation keeps angles usable for cotangents); coarser ones, and huge faces, are
+//! subdivided. Vertices are rounded to single precision, in which they are stored, so that a fresh
+//! proxy and a stored one give the same results.
 
 use super::clean::{corner_word, is_degenerate, normalize};
 use super::refine::refine;
 use super::{Bvh, FaceGeometry, Search, TriMesh, dot, scale, sub};
 use meshopt::{SimplifyOptions, VertexDataAdapter};
 
-/// A mesh is simplified when it has more faces than this times what was asked for.
+/// A mesh is simplified when it has more faces than this times the working resolution.
 const EXCESS: f64 = 1.15;
-/// Below this many faces a mesh is cut up to `REFINED_FACES`: descriptors and patches need samples.
+/// Below this many faces a mesh is subdivided up to `REFINED_FACES`: descriptors and patches need
+/// samples.
 const MIN_FACES: usize = 600;
 const REFINED_FACES: usize = 1_000;
 /// An edge longer than this times the edge of `working_faces` equal triangles is halved.
 const LONG_EDGE: f64 = 6.0;
-/// Results with more faces than this times what was asked for are simplified with less regard.
+/// Results with more faces than this times the working resolution are simplified more aggressively.
 const TOO_FINE: f64 = 1.5;
 /// Triangles lower than this fraction of their longest edge may not survive single precision.
 const MIN_HEIGHT: f64 = 1e-6;
-/// Of two faces equally far, one whose normal is opposite counts as this much farther, in mean edges.
+/// Of two equally distant faces, one whose normal is opposite counts as this much farther, in mean
+/// edges.
 const OPPOSITE: f64 = 1.0;
 
-/// A mesh at working resolution and the way back from it.
+/// A mesh at working resolution with the map from the cleaned mesh.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Proxy {
     /// Centred, total area 1 (to single precision), every vertex used and every face with an area.
@@ -35,9 +38,9 @@ pub struct Proxy {
 
 /// A mesh of about `working_faces` faces for a cleaned one, which must have a face.
 ///
-/// Each cleaned face maps to the proxy face nearest to its centroid, a face that looks the other
-/// way counting as farther, so that the two sides of a thin wall are not confused. Components may
-/// vanish when there are too many; their faces map to the nearest ones that stay. O(m log m).
+/// Each cleaned face maps to the proxy face nearest to its centroid. A face with an opposite normal
+/// counts as farther, so that the two sides of a thin wall are not confused. Components may vanish
+/// when there are too many; their faces map to the nearest ones that stay. O(m log m).
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, clean, icosphere, parse, proxy, write};
@@ -73,7 +76,7 @@ pub fn proxy(cleaned: &TriMesh, working_faces: u32) -> Proxy {
     let (_, center, factor) = normalize(&mut mesh);
     let n_exact = mesh.faces.len();
     let Some(rounded) = round(&mesh) else {
-        // All of it is thinner than single precision resolves.
+        // The whole mesh is thinner than the resolution of single precision.
         return Proxy {
             mesh: cleaned.clone(),
             face_map: (0..n as u32).collect(),
@@ -90,7 +93,7 @@ pub fn proxy(cleaned: &TriMesh, working_faces: u32) -> Proxy {
     }
 }
 
-/// Faces left of a mesh when it is simplified to about `target`; at least one, each with an area.
+/// The faces of a mesh after simplification to about `target`; at least one, each with an area.
 fn simplify(mesh: &TriMesh, target: usize) -> Vec<[u32; 3]> {
     let positions: Vec<[f32; 3]> = mesh.vertices.iter().map(|p| p.map(|x| x as f32)).collect();
     let bytes = bytemuck::cast_slice(&positions);
@@ -116,7 +119,8 @@ fn simplify(mesh: &TriMesh, target: usize) -> Vec<[u32; 3]> {
     };
     let mut best = attempt(SimplifyOptions::Regularize);
     if best.len() as f64 > limit || best.is_empty() {
-        // Many small components or non-manifold vertices: let the smallest components go.
+        // The mesh has many small components or non-manifold vertices, so the smallest components
+        // are dropped.
         let pruned = attempt(SimplifyOptions::Regularize | SimplifyOptions::Prune);
         if !pruned.is_empty() {
             best = pruned;
@@ -130,7 +134,7 @@ fn simplify(mesh: &TriMesh, target: usize) -> Vec<[u32; 3]> {
             1.0,
             None,
         ));
-        // Clustering of vertices can overshoot; half of what was asked for is the least to be taken.
+        // Clustering of vertices can overshoot; results below half of the target are rejected.
         if 2 * sloppy.len() > target {
             best = sloppy;
         }
@@ -142,10 +146,10 @@ fn simplify(mesh: &TriMesh, target: usize) -> Vec<[u32; 3]> {
     }
 }
 
-/// The faces between distinct positions, without those that coincide or collapse: simplification takes
-/// vertices at one position for a seam and will not move them.
+/// The faces between distinct positions, without those that coincide or collapse: simplification
+/// treats vertices at one position as a seam and does not move them.
 fn weld(positions: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[u32; 3]> {
-    // As in cleaning, words that hold all that is sorted by.
+    // As in cleaning, each word holds the whole sort key.
     let mut order: Vec<u128> = (0_u32..)
         .zip(positions)
         .map(|(v, p)| {
@@ -178,7 +182,8 @@ fn weld(positions: &[[f32; 3]], faces: &[[u32; 3]]) -> Vec<[u32; 3]> {
     kept.iter().map(|&f| renamed[f as usize]).collect()
 }
 
-/// Drops vertices that no face uses; returns for each vertex its new index, `u32::MAX` for one that is dropped.
+/// Drops vertices that no face uses; returns for each vertex its new index, `u32::MAX` for a
+/// dropped one.
 pub(super) fn compact(mesh: &mut TriMesh) -> Vec<u32> {
     let mut new = vec![u32::MAX; mesh.vertices.len()];
     let mut vertices = Vec::new();
@@ -194,7 +199,7 @@ pub(super) fn compact(mesh: &mut TriMesh) -> Vec<u32> {
     new
 }
 
-/// The mesh in single precision, without the faces that vanish thereby; `None` when all do.
+/// The mesh in single precision, without the faces that vanish in it; `None` when all do.
 fn round(mesh: &TriMesh) -> Option<TriMesh> {
     let mut result = mesh.clone();
     for p in &mut result.vertices {
@@ -213,13 +218,13 @@ fn round(mesh: &TriMesh) -> Option<TriMesh> {
     (!result.faces.is_empty()).then_some(result)
 }
 
-/// The proxy face of each cleaned face; `center` and `factor` take cleaned coordinates to those of the
-/// proxy.
+/// The proxy face of each cleaned face; `center` and `factor` transform cleaned coordinates to
+/// those of the proxy.
 fn face_map(cleaned: &TriMesh, center: [f64; 3], factor: f64, proxy: &TriMesh) -> Vec<u32> {
     let from = FaceGeometry::new(cleaned);
     let to = FaceGeometry::new(proxy);
     let tree = Bvh::new(proxy);
-    // Edge of equilateral triangles of the mean area.
+    // Edge of an equilateral triangle of the mean area.
     let mean_edge = (4.0 / 3.0_f64.sqrt() / proxy.faces.len() as f64).sqrt();
     let mut hint = 0_u32;
     let mut search = Search::default();
@@ -229,7 +234,8 @@ fn face_map(cleaned: &TriMesh, center: [f64; 3], factor: f64, proxy: &TriMesh) -
         let extra = |face: u32| {
             0.5 * OPPOSITE * mean_edge * (1.0 - dot(*normal, to.normals[face as usize])).max(0.0)
         };
-        // Neighbours in the file are mostly neighbours in space: the last answer bounds this search.
+        // Neighbours in the file are mostly neighbours in space, so the last answer bounds this
+        // search.
         let bound = tree.distance_to(hint, point) + extra(hint);
         let limit = bound * (1.0 + 1e-9) + f64::MIN_POSITIVE;
         hint = tree

@@ -1,22 +1,22 @@
-//! Coarse triangles become finer ones by halving the longest edge, again and again.
+//! Refines coarse triangles by halving the longest edge repeatedly.
 //!
 //! The globally longest edge is the longest of each face it borders, so angles stay bounded (Rivara
-//! 1984, *Algorithms for refining triangular grids suitable for adaptive and multigrid techniques*), and
-//! all faces around it are cut together, so no cracks open.
+//! 1984, *Algorithms for refining triangular grids suitable for adaptive and multigrid
+//! techniques*), and all faces around it are cut together, so no cracks open.
 
 use super::{TriMesh, add, distance, scale};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 
-/// Halves edges, longest first, while `go_on(length of the longest edge, number of faces)`. The surface
-/// stays exactly as it was. O(log n) for each cut.
+/// Halves edges, longest first, while `go_on(length of the longest edge, number of faces)`. The
+/// surface does not change. O(log n) for each cut.
 pub(super) fn refine(mesh: &mut TriMesh, go_on: impl Fn(f64, usize) -> bool) {
     let mut faces_of: BTreeMap<[u32; 2], Vec<u32>> = BTreeMap::new();
     let mut queue = BinaryHeap::new();
     let key = |a: u32, b: u32| [a.min(b), a.max(b)];
     let entry = |mesh: &TriMesh, edge: [u32; 2]| {
         let [p, q] = edge.map(|v| mesh.vertices[v as usize]);
-        // Non-negative doubles are ordered like their bits.
+        // Non-negative doubles have the same order as their bits.
         (distance(p, q).to_bits(), Reverse(edge))
     };
     for (f, &[a, b, c]) in mesh.faces.iter().enumerate() {

@@ -1,11 +1,11 @@
-//! A clean report becomes named counts and back, for whoever writes it down.
+//! Converts a clean report to named counts and back, for storage and messages.
 
 use super::CleanReport;
 
 macro_rules! counts {
     (first: $($name:ident),+; later: $($later:ident),+ $(,)?) => {
         impl CleanReport {
-            /// Every count with its name.
+            /// All counts with their names.
             ///
             /// ```
             /// use coseg_geometry::mesh::CleanReport;
@@ -14,14 +14,14 @@ macro_rules! counts {
             /// assert_eq!(report.counts()[0], ("n_polygons", 12));
             /// ```
             pub fn counts(&self) -> Vec<(&'static str, usize)> {
-                // Without `..`, so that a new count cannot be forgotten.
+                // No `..` here, so that a new count cannot be forgotten.
                 let Self { $($name,)+ $($later),+ } = *self;
                 vec![$((stringify!($name), $name),)+ $((stringify!($later), $later)),+]
             }
 
-            /// The report whose counts `count` gives by name; its first error is returned, and that
-            /// of `missing` for a count that is not there. Reports of the first release lack the
-            /// later counts: those are 0.
+            /// The report whose counts `count` returns by name. It fails with the first error of
+            /// `count`, or that of `missing` for a missing count. Reports of version 0.1.0 lack the
+            /// later counts, which are then 0.
             pub fn from_counts<E>(
                 count: impl Fn(&'static str) -> Result<Option<usize>, E>,
                 missing: impl Fn(&'static str) -> E,
@@ -60,8 +60,9 @@ counts!(
 );
 
 impl CleanReport {
-    /// Whether the first release described the same bytes in another way: it took the fan of every
-    /// polygon, dropped words that are read now, and analysed inner walls with the outer ones.
+    /// Whether version 0.1.0 described the same bytes differently: it used the fan of every
+    /// polygon, dropped words that are read now, and analysed inner walls together with the outer
+    /// ones.
     pub fn differs_from_first_release(&self) -> bool {
         self.n_concave_polygons + self.n_tolerated_statements + self.n_inner_walls > 0
     }

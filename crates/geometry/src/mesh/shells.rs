@@ -1,38 +1,42 @@
-//! Of two walls at a small distance one is analysed and stands for both.
+//! Removes one of two walls at a small distance from the analysis; the other represents both.
 //!
-//! Scans and generated meshes often have a thin inner wall: a second surface, of its own component, a
-//! little behind the outer one and turned over. Rays cast inward end at it, the spectrum has everything
-//! twice, and a labelling can do no better than to tell the walls apart. Such a wall is taken off before
-//! anything is computed, and each of its triangles is given the nearest face of the wall that stays.
+//! Scans and generated meshes often have a thin inner wall: a second surface, of its own component,
+//! a little behind the outer one and flipped. Rays cast inward end at it, the spectrum contains
+//! everything twice, and the best labelling would only separate the walls. Such a wall is removed
+//! before anything is computed, and each of its triangles is mapped to the nearest face of the wall
+//! that stays.
 //!
-//! Two surfaces are walls of one shell if either, seen from nearly everywhere on the other, is the first
-//! thing behind it. What merely lies close is not: a ray into a board that lies on another leaves through
-//! its own far side first. A vessel whose walls meet at its rim is one component, and stays as it is.
+//! Two surfaces are walls of one shell if either, seen from nearly everywhere on the other, is the
+//! first surface behind it. Close surfaces need not be: a ray into a board that lies on another
+//! leaves through its own far side first. A vessel whose walls meet at its rim is one component,
+//! and stays unchanged.
 
 use super::adjacency::{EdgeFaces, components};
 use super::clean::{Cleaned, normalize};
 use super::proxy::compact;
 use super::{Bvh, FaceGeometry, Search, TriMesh, add, dot, scale, sub};
 
-/// Walls are at most this far apart, as a fraction of the diagonal of the whole mesh: twice a hundredth
-/// of its size.
+/// The largest distance between walls, as a fraction of the diagonal of the whole mesh: twice a
+/// hundredth of its size.
 const MAX_GAP: f64 = 0.02;
-/// And as a fraction of the diagonal of the outer one: small pieces have thinner walls.
+/// The largest distance as a fraction of the diagonal of the outer wall: small pieces have thinner
+/// walls.
 const MAX_OWN_GAP: f64 = 0.05;
-/// Copies that are not turned over must be this near, as a fraction of the diagonal of the mesh: what
-/// fits closely into another is not its copy.
+/// The largest distance between copies that are not flipped, as a fraction of the diagonal of the
+/// mesh: a component that fits closely into another is not its copy.
 const MAX_COPY_GAP: f64 = 0.002;
-/// Components with a smaller share of the area are not looked at.
+/// Components with a smaller share of the area are ignored.
 const MIN_SHARE: f64 = 1e-3;
-/// The area of the inner wall over that of the outer one; walls of a hundredth take away much of thin limbs.
+/// Least ratio of the areas of the inner and the outer wall; walls of a hundredth reduce thin limbs
+/// considerably.
 const MIN_AREA_RATIO: f64 = 0.5;
 const MAX_AREA_RATIO: f64 = 1.25;
-/// Share of the inner wall that must have the outer one behind it, and the other way round.
+/// Share of the inner wall that must have the outer one behind it, and vice versa.
 const MIN_BACKED: f64 = 0.9;
 const MIN_COVERED: f64 = 0.7;
-/// Points of a wall that are looked at.
+/// Number of sample points of a wall.
 const N_SAMPLES: usize = 400;
-/// How far in front of a surface rays to its copy begin, as a fraction of the gap.
+/// Distance in front of a surface at which rays to its copy begin, as a fraction of the gap.
 const COPY_START: f64 = 1e-2;
 /// Least cosine between the normals of walls.
 const MIN_COSINE: f64 = 0.5;
@@ -45,22 +49,22 @@ struct Wall {
     high: [f64; 3],
 }
 
-/// A component alone, and what answers where it is.
+/// A component as a mesh of its own, with a search tree.
 struct Surface {
     mesh: TriMesh,
     geometry: FaceGeometry,
     tree: Bvh,
 }
 
-/// How a wall lies to the one behind it: turned over, or a copy of it.
+/// The orientation of a wall relative to the one behind it: flipped, or a copy.
 #[derive(Clone, Copy, PartialEq)]
 enum Turn {
     Opposite,
     Same,
 }
 
-/// The mesh without the walls that have another close by, and the map from triangles and polygons
-/// to it. A mesh without such walls stays as it is. O(m log m) for one with them, else O(m).
+/// The mesh without the walls that have another close by, with the map from triangles and polygons
+/// to it. A mesh without such walls stays unchanged. O(m log m) for one with them, else O(m).
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, TriMesh, clean, icosphere, outer_shells, parse, write};
@@ -89,7 +93,7 @@ pub fn outer_shells(cleaned: Cleaned) -> Cleaned {
         return cleaned;
     }
     let size = diagonal(&walls);
-    // For each face the one that stands for it.
+    // For each face the face that represents it.
     let mut stands: Vec<u32> = (0..mesh.faces.len() as u32).collect();
     let mut surfaces: Vec<Option<Surface>> = walls.iter().map(|_| None).collect();
     let mut dropped = vec![false; walls.len()];
@@ -126,7 +130,7 @@ pub fn outer_shells(cleaned: Cleaned) -> Cleaned {
     }
 }
 
-/// The components with a share of the area that counts, largest diagonal first.
+/// The components with a large enough share of the area, largest diagonal first.
 fn walls(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<Wall> {
     let (component, count) = components(mesh.faces.len(), &EdgeFaces::new(&mesh.faces));
     let mut areas = vec![0.0; count];
@@ -157,7 +161,7 @@ fn walls(mesh: &TriMesh, geometry: &FaceGeometry) -> Vec<Wall> {
             wall.high = std::array::from_fn(|i| wall.high[i].max(p[i]));
         }
     }
-    // Stable: of two that are as large the first of the file is the outer one.
+    // The sort is stable: of two equally large walls the first in the file is the outer one.
     walls.sort_by(|a, b| b.diagonal().total_cmp(&a.diagonal()));
     walls
 }
@@ -192,7 +196,7 @@ fn candidates(walls: &[Wall]) -> Vec<(usize, usize)> {
     for (o, outer) in walls.iter().enumerate() {
         let gap = max_gap(outer, size);
         for (i, inner) in walls.iter().enumerate().skip(o + 1) {
-            // They come by their diagonals.
+            // They are ordered by their diagonals.
             if outer.diagonal() - inner.diagonal() > 4.0 * gap {
                 break;
             }
@@ -234,7 +238,8 @@ impl Surface {
 
     /// Points spread evenly over the area, with their faces; the same in every run.
     fn samples(&self) -> Vec<(u32, [f64; 3])> {
-        // Fractions of the golden ratio's and the plastic number's powers: even in one and in two dimensions.
+        // Fractions of the powers of the golden ratio and of the plastic number: evenly spread in
+        // one and in two dimensions.
         const PLASTIC: [f64; 2] = [0.754_877_666_246_692_7, 0.569_840_290_998_053_2];
         let total: f64 = self.geometry.areas.iter().sum();
         let step = total / N_SAMPLES as f64;
@@ -255,7 +260,7 @@ impl Surface {
         samples
     }
 
-    /// For each face the face of another surface that is nearest, as it is turned.
+    /// For each face the nearest face of another surface, for this orientation.
     fn nearest_on(&self, other: &Self, gap: f64, turn: Turn) -> Vec<u32> {
         let mut search = Search::default();
         let faces = self.geometry.centroids.iter().zip(&self.geometry.normals);
@@ -271,7 +276,7 @@ impl Surface {
 }
 
 impl Turn {
-    /// 1 where two normals are as this says, −1 where they are the other way.
+    /// 1 if two normals have this orientation, −1 if they have the opposite one.
     fn cosine(self, a: [f64; 3], b: [f64; 3]) -> f64 {
         match self {
             Self::Opposite => -dot(a, b),
@@ -280,11 +285,11 @@ impl Turn {
     }
 }
 
-/// Share of `from`'s area behind which `to` is the first thing within `gap`, facing the other way; for
-/// copies the first thing on either side, facing the same way.
+/// Share of `from`'s area behind which `to` is the first surface within `gap`, facing the opposite
+/// way; for copies the first surface on either side, facing the same way.
 fn backed(from: &Surface, to: &Surface, gap: f64, turn: Turn) -> f64 {
     let (mut search, mut own, mut others) = (Search::default(), Vec::new(), Vec::new());
-    // A copy may lie in the very same place, which a ray that begins there would miss.
+    // A copy may lie in exactly the same position, which a ray that begins there would miss.
     let before = if turn == Turn::Same {
         COPY_START * gap
     } else {
@@ -318,7 +323,7 @@ fn backed(from: &Surface, to: &Surface, gap: f64, turn: Turn) -> f64 {
     n_backed as f64 / samples.len().max(1) as f64
 }
 
-/// Takes off the faces for which another stands.
+/// Removes the faces that another one represents.
 fn without(cleaned: Cleaned, stands: &[u32], dropped: &[bool]) -> Cleaned {
     let stays = |f: &usize| stands[*f] as usize == *f;
     let mut new = vec![u32::MAX; stands.len()];
@@ -434,7 +439,7 @@ mod tests {
                 );
                 let total: f64 = FaceGeometry::new(&after.mesh).areas.iter().sum();
                 assert!((total - 1.0).abs() < 1e-9);
-                // Each polygon is with the one outside of it; each vertex is where it was, or has gone.
+                // Each polygon maps to the one outside of it; each vertex stays or vanishes.
                 for i in 0..m {
                     let [a, b] = [i, i + m].map(|p| after.face_of_polygon[p]);
                     assert_eq!(a, b, "polygon {i}, gap {gap}");
@@ -470,7 +475,7 @@ mod tests {
                 .n_inner_walls,
             1
         );
-        // Each piece with a wall of its own.
+        // Each piece has a wall of its own.
         let at = |mesh: TriMesh| zoo::moved(&mesh, [3.0, 0.0, 0.0]);
         let walls = [
             ball(1.0),
@@ -492,7 +497,7 @@ mod tests {
             board([0.0; 3], [1.0, 1.0, 0.005]),
             board([0.0, 0.0, 0.005], [1.0, 1.0, 0.01]),
         ];
-        let apart = [
+        let gap_boards = [
             board([0.0; 3], [1.0, 1.0, 0.02]),
             board([0.0, 0.0, 0.021], [1.0, 1.0, 0.04]),
         ];
@@ -502,14 +507,14 @@ mod tests {
             sheet.clone(),
             zoo::moved(&zoo::inside_out(&sheet), [0.5, 0.0, -0.005]),
         ];
-        // Sheets whose backs are turned to each other have nothing between them.
+        // Sheets that turn their backs to each other have nothing between them.
         let facing = [
             sheet.clone(),
             zoo::moved(&zoo::inside_out(&sheet), [0.0, 0.0, 0.01]),
         ];
         for (name, parts) in [
             ("a board on another", thin.to_vec()),
-            ("two boards with a gap", apart.to_vec()),
+            ("two boards with a gap", gap_boards.to_vec()),
             ("a block within a box", within.to_vec()),
             ("a drinking vessel", vec![vessel(1.0, 0.01)]),
             (

@@ -1,10 +1,10 @@
-//! Small meshes with one defect each, on which every algorithm is run.
+//! Small meshes with one defect each, for testing every algorithm.
 
 use super::{ParsedMesh, TriMesh, add, clean, scale};
 
 pub(crate) use super::icosphere::icosphere as sphere;
 
-/// Unit cube, two triangles a side.
+/// Unit cube, two triangles for each side.
 pub(crate) fn cube() -> TriMesh {
     let vertices = (0..8)
         .map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from))
@@ -124,7 +124,7 @@ pub(crate) fn dumbbell(n: u32) -> TriMesh {
     mesh
 }
 
-/// Every face turned over.
+/// Flips every face.
 pub(crate) fn inside_out(mesh: &TriMesh) -> TriMesh {
     let faces = mesh.faces.iter().map(|&[a, b, c]| [a, c, b]).collect();
     TriMesh {
@@ -133,7 +133,7 @@ pub(crate) fn inside_out(mesh: &TriMesh) -> TriMesh {
     }
 }
 
-/// Coordinates times a factor.
+/// Multiplies coordinates by a factor.
 pub(crate) fn scaled(mesh: &TriMesh, factor: f64) -> TriMesh {
     let vertices = mesh.vertices.iter().map(|&p| scale(p, factor)).collect();
     TriMesh {
@@ -142,7 +142,7 @@ pub(crate) fn scaled(mesh: &TriMesh, factor: f64) -> TriMesh {
     }
 }
 
-/// Coordinates plus an offset.
+/// Adds an offset to coordinates.
 pub(crate) fn moved(mesh: &TriMesh, offset: [f64; 3]) -> TriMesh {
     let vertices = mesh.vertices.iter().map(|&p| add(p, offset)).collect();
     TriMesh {
@@ -151,7 +151,7 @@ pub(crate) fn moved(mesh: &TriMesh, offset: [f64; 3]) -> TriMesh {
     }
 }
 
-/// Turned about an oblique axis.
+/// Turns the mesh about an oblique axis.
 pub(crate) fn rotated(mesh: &TriMesh) -> TriMesh {
     let (s, c) = 0.7_f64.sin_cos();
     let (t, d) = 1.9_f64.sin_cos();
@@ -169,7 +169,7 @@ pub(crate) fn rotated(mesh: &TriMesh) -> TriMesh {
     }
 }
 
-/// Vertices, faces and corners in another order, and for each new face the old one.
+/// Reorders vertices, faces and corners; returns for each new face the old one.
 pub(crate) fn renumbered(mesh: &TriMesh) -> (TriMesh, Vec<usize>) {
     // A step coprime to the count visits everything once.
     let shuffle = |n: usize| -> Vec<usize> {
@@ -196,7 +196,7 @@ fn gcd(a: usize, b: usize) -> usize {
     if b == 0 { a } else { gcd(b, a % b) }
 }
 
-/// Meshes side by side in one list, as they are.
+/// Meshes side by side in one list, unchanged.
 pub(crate) fn union(meshes: &[TriMesh]) -> TriMesh {
     let mut all = TriMesh::default();
     for mesh in meshes {
@@ -220,7 +220,7 @@ pub(crate) fn parsed(mesh: &TriMesh) -> ParsedMesh {
     }
 }
 
-/// Every triangle with vertices of its own.
+/// Gives every triangle vertices of its own.
 pub(crate) fn soup(mesh: &TriMesh) -> ParsedMesh {
     let vertices = (0..mesh.faces.len())
         .flat_map(|f| mesh.corners(f))
@@ -231,7 +231,7 @@ pub(crate) fn soup(mesh: &TriMesh) -> ParsedMesh {
     parsed(&TriMesh { vertices, faces })
 }
 
-/// The zoo: a name that says the defect, and the mesh.
+/// The zoo: names of defects, each with a mesh.
 pub(crate) fn dirty_meshes() -> Vec<(&'static str, ParsedMesh)> {
     let ball = sphere(2);
     let with = |change: &dyn Fn(&mut TriMesh)| {

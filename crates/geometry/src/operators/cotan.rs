@@ -1,10 +1,10 @@
-//! A mesh becomes the classical cotangent Laplacian (Pinkall and Polthier 1993) with barycentric
-//! lumped mass. Obtuse triangles give negative weights; W stays positive semidefinite.
+//! Computes the classical cotangent Laplacian of a mesh (Pinkall and Polthier 1993) with
+//! barycentric lumped mass. Obtuse triangles give negative weights; W stays positive semidefinite.
 
 use super::{Edge, LaplacianError, cross, difference, dot};
 use crate::mesh::TriMesh;
 
-/// Edge weights `(cot α + cot β) / 2` and vertex masses, a third of the area around.
+/// Edge weights `(cot α + cot β) / 2` and vertex masses, a third of the area of the adjacent faces.
 pub(super) fn cotan(mesh: &TriMesh) -> Result<(Vec<Edge>, Vec<f64>), LaplacianError> {
     let mut edges = Vec::with_capacity(3 * mesh.faces.len());
     let mut mass = vec![0.0; mesh.vertices.len()];

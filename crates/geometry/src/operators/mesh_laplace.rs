@@ -1,6 +1,6 @@
-//! A mesh becomes the mesh Laplacian of Belkin, Sun and Wang, *Discrete Laplace Operator on Meshed
-//! Surfaces*, 2008, in symmetric form: heat-kernel weights between all vertices that are near each
-//! other in space.
+//! Computes the mesh Laplacian of Belkin, Sun and Wang, *Discrete Laplace Operator on Meshed
+//! Surfaces*, 2008, in symmetric form: it has heat-kernel weights between all vertices that are
+//! near each other in space.
 //!
 //! `K_ij = a_i a_j exp(-d_ij² / 4h) / (4π h²)`, `W = diag(K 1) - K`, `A = diag(a)`, with vertex
 //! areas a (a third of the faces around) and `h = ē² / 4` for the mean edge length ē. Its spectrum
@@ -10,7 +10,7 @@ use super::{Edge, cross, difference, distance, dot};
 use crate::mesh::TriMesh;
 use std::collections::HashMap;
 
-/// Weights below this share of the largest possible one are left out.
+/// Weights below this share of the largest possible one are omitted.
 const TRUNCATION: f64 = 1e-6;
 
 /// Edge weights and vertex masses.
@@ -35,7 +35,7 @@ pub(super) fn mesh_laplace(mesh: &TriMesh) -> (Vec<Edge>, Vec<f64>) {
         .sum();
     let mean = total / mesh_edges.len() as f64;
     if !(mean > 0.0 && mean.is_finite()) {
-        // All vertices coincide: the masses are zero, which the caller refuses.
+        // All vertices coincide: the masses are zero, which the caller rejects.
         return (Vec::new(), mass);
     }
     let h = 0.25 * mean * mean;

@@ -6,7 +6,7 @@ mod tufted;
 
 use crate::mesh::{Bridge, TriMesh};
 
-/// Which discrete Laplacian.
+/// The kinds of discrete Laplacians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Operator {
     /// Intrinsic Delaunay on the tufted cover with mollification (Sharp and Crane 2020).
@@ -30,7 +30,7 @@ pub struct Laplacian {
 /// Why a mesh has no Laplacian.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LaplacianError {
-    /// No face.
+    /// The mesh has no face.
     #[error("the mesh has {n_vertices} vertices but no face")]
     Empty {
         /// Vertices of the mesh.
@@ -39,7 +39,7 @@ pub enum LaplacianError {
     /// A coordinate is not finite.
     #[error("coordinate {axis} of vertex {vertex} is {value}, but must be finite")]
     NonFinite {
-        /// Which vertex.
+        /// Index of the vertex.
         vertex: usize,
         /// 0, 1 or 2.
         axis: usize,
@@ -49,9 +49,9 @@ pub enum LaplacianError {
     /// A face names a vertex that does not exist.
     #[error("face {face} names vertex {vertex}, but the mesh has {n_vertices}")]
     OutOfRange {
-        /// Which face.
+        /// Index of the face.
         face: usize,
-        /// What it names.
+        /// The vertex that it names.
         vertex: u32,
         /// Vertices of the mesh.
         n_vertices: usize,
@@ -59,21 +59,21 @@ pub enum LaplacianError {
     /// A face names a vertex twice.
     #[error("face {face} names vertex {vertex} more than once, but needs three different corners")]
     RepeatedCorner {
-        /// Which face.
+        /// Index of the face.
         face: usize,
-        /// Which vertex.
+        /// Index of the vertex.
         vertex: u32,
     },
     /// A vertex without a face would have no mass.
     #[error("vertex {vertex} belongs to no face, but each needs at least one")]
     Unreferenced {
-        /// Which vertex.
+        /// Index of the vertex.
         vertex: usize,
     },
     /// A face with zero area has no cotangents.
     #[error("face {face} has area {area}, but this operator needs a positive one; use tufted")]
     DegenerateFace {
-        /// Which face.
+        /// Index of the face.
         face: usize,
         /// Its area.
         area: f64,
@@ -81,7 +81,7 @@ pub enum LaplacianError {
     /// A vertex whose mass is not a positive number.
     #[error("the mass of vertex {vertex} is {mass}, but must be positive and finite")]
     Mass {
-        /// Which vertex.
+        /// Index of the vertex.
         vertex: usize,
         /// Its mass.
         mass: f64,
@@ -89,7 +89,7 @@ pub enum LaplacianError {
     /// A weight is not finite.
     #[error("the weight between vertices {vertices:?} is {weight}, but must be finite")]
     Weight {
-        /// Either end.
+        /// The vertices that it joins.
         vertices: [u32; 2],
         /// The weight.
         weight: f64,
@@ -97,9 +97,9 @@ pub enum LaplacianError {
     /// A bridge names a vertex that does not exist.
     #[error("bridge {bridge} joins vertices {vertices:?}, but there are only {n_vertices}")]
     Bridge {
-        /// Which bridge.
+        /// Index of the bridge.
         bridge: usize,
-        /// What it names.
+        /// The vertices that it names.
         vertices: [u32; 2],
         /// Vertices of the mesh.
         n_vertices: usize,
@@ -108,9 +108,9 @@ pub enum LaplacianError {
 
 /// Weight of a bridge, in mean edge weights.
 ///
-/// Two components of areas a and b joined by a bridge of weight w get one eigenvalue of about
-/// `w (1/a + 1/b)` in the place of a second 0: with unit total area a few hundredths, far below the
-/// first eigenvalues of the components (10 and more) and far above rounding (1e-10). All other
+/// Two components of areas a and b joined by a bridge of weight w get one eigenvalue of about `w
+/// (1/a + 1/b)` in place of a second 0: with unit total area a few hundredths, far below the first
+/// eigenvalues of the components (10 and more) and far above rounding (1e-10). All other
 /// eigenvalues move by about `w (φ(p) - φ(q))²`, a tenth of a percent.
 const BRIDGE_WEIGHT: f64 = 0.01;
 
@@ -136,8 +136,8 @@ const BRIDGE_WEIGHT: f64 = 0.01;
 /// ```
 ///
 /// # Errors
-/// Every vertex needs a face and finite coordinates. Faces of zero area are refused by
-/// [`Operator::Cotan`] and accepted by the others.
+/// If a vertex has no face or a coordinate is not finite. [`Operator::Cotan`] also rejects faces of
+/// zero area, which the others accept.
 pub fn laplacian(
     mesh: &TriMesh,
     bridges: &[Bridge],
@@ -161,9 +161,9 @@ pub fn laplacian(
         let total: f64 = merged.iter().map(|e| e.weight.abs()).sum();
         total / merged.len().max(1) as f64
     };
-    // Components that share a vertex are joined there already.
-    let apart = bridges.iter().filter(|b| b.vertices[0] != b.vertices[1]);
-    edges.extend(apart.map(|b| Edge {
+    // Components that share a vertex are joined by it already.
+    let separate = bridges.iter().filter(|b| b.vertices[0] != b.vertices[1]);
+    edges.extend(separate.map(|b| Edge {
         vertices: [
             b.vertices[0].min(b.vertices[1]),
             b.vertices[0].max(b.vertices[1]),

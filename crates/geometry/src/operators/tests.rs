@@ -43,7 +43,7 @@ fn good_meshes() -> Vec<TriMesh> {
     ]
 }
 
-/// Vertices up to which all eigenvalues are looked at.
+/// Meshes with at most this many vertices have all their eigenvalues checked.
 const MAX_DENSE: usize = 600;
 
 fn assert_laplacian(l: &Laplacian, operator: Operator) {
@@ -110,7 +110,7 @@ fn every_mesh_of_the_zoo_gives_a_semidefinite_stiffness_or_a_named_refusal() {
             }
         }
     }
-    // Only plain cotangents refuse what cleaning lets through.
+    // Only plain cotangents reject faces that cleaning accepts.
     let cotangents = |r: &(&str, Operator, LaplacianError)| r.1 == Operator::Cotan;
     assert!(refusals.iter().all(cotangents), "{refusals:?}");
     assert!(
@@ -220,11 +220,11 @@ fn bridges_join_components_with_a_small_weight() {
         length: 1.0,
     };
     for operator in [Operator::Tufted, Operator::Cotan] {
-        let apart = laplacian(&mesh, &[], operator).unwrap();
+        let separate = laplacian(&mesh, &[], operator).unwrap();
         let joined = laplacian(&mesh, &[bridge], operator).unwrap();
         assert_laplacian(&joined, operator);
-        assert_eq!(apart.mass, joined.mass);
-        assert_eq!(joined.stiffness.nnz(), apart.stiffness.nnz() + 2);
+        assert_eq!(separate.mass, joined.mass);
+        assert_eq!(joined.stiffness.nnz(), separate.stiffness.nnz() + 2);
         let w = -joined.stiffness.get(3, n as usize / 2).unwrap();
         assert!(w > 0.003 && w < 0.01, "{w}");
     }

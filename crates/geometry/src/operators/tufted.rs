@@ -1,5 +1,5 @@
-//! Any triangle mesh becomes the intrinsic Delaunay Laplacian of its tufted cover: no negative
-//! weights, and no need for manifold edges, orientation or well-shaped triangles.
+//! Computes the intrinsic Delaunay Laplacian of the tufted cover of any triangle mesh. It has no
+//! negative weights, and needs no manifold edges, orientation or well-shaped triangles.
 //!
 //! Sharp and Crane, *A Laplacian for Nonmanifold Triangle Meshes*, 2020. Each face gets a front and
 //! a back; around every edge neighbouring sides are glued, which closes boundaries and separates
@@ -43,8 +43,8 @@ impl Side {
     }
 }
 
-/// A closed intrinsic triangulation. Per side (three a face): the vertex it starts from, its
-/// length, and the side on the other face. Glued sides run in opposite directions.
+/// A closed intrinsic triangulation. For each side (three for each face) it holds the start vertex,
+/// the length, and the side on the other face. Glued sides run in opposite directions.
 struct Cover {
     tails: Vec<u32>,
     lengths: Vec<f64>,
@@ -121,7 +121,7 @@ impl Cover {
         cover
     }
 
-    /// Glues the sides around one edge: each sheet's one face to the next sheet's facing one.
+    /// Glues the sides around one edge: a face of each sheet to the facing side of the next sheet.
     fn glue_around(&mut self, mesh: &TriMesh, group: &[([u32; 2], u32, u8)]) {
         let [a, b] = group[0].0;
         let mut sheets: Vec<(f64, u32, u8)> = group.iter().map(|g| (0.0, g.1, g.2)).collect();
@@ -150,7 +150,7 @@ impl Cover {
                 face: 2 * f,
                 side: s,
             };
-            // Side 0, 1, 2 of the front lie on the same edge as side 0, 2, 1 of the back.
+            // Sides 0, 1, 2 of the front lie on the same edges as sides 0, 2, 1 of the back.
             let back = Side {
                 face: 2 * f + 1,
                 side: (3 - s) % 3,
@@ -190,8 +190,8 @@ impl Cover {
     fn flip_to_delaunay(&mut self) {
         let mut queue: Vec<usize> = (0..self.tails.len()).rev().collect();
         let mut queued = vec![true; self.tails.len()];
-        // Flips end, since each lowers the Dirichlet energy; rounding could make a cycle of
-        // cocircular ones, which the slack prevents. The bound only guards against an unknown.
+        // Flips end, since each lowers the Dirichlet energy. Rounding could make a cycle of
+        // cocircular ones, which the slack prevents. The bound guards against unknown cases only.
         let mut budget = 200 * self.tails.len();
         while let Some(slot) = queue.pop() {
             queued[slot] = false;
@@ -233,7 +233,7 @@ impl Cover {
             let (lx, ly) = apex(lengths[2], lengths[3]);
             (kx - lx).hypot(ky + ly)
         };
-        // Neighbours may be sides of these two faces themselves: remember them by name.
+        // Neighbours may be sides of these two faces themselves, so their indices are kept.
         let old = [jk, ki, il, lj];
         let across = old.map(|s| self.glued[s.slot()]);
         // New face 1: k i l (sides ki, il, lk); new face 2: l j k (sides lj, jk, kl).

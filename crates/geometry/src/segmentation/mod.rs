@@ -1,4 +1,4 @@
-//! One shape's faces become patches and parts, before anything is known of other shapes.
+//! Divides the faces of one shape into patches and parts, without knowledge of other shapes.
 
 mod parts;
 mod patches;

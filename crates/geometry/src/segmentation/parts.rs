@@ -1,4 +1,5 @@
-//! Patches of one shape are merged into parts, and parts are described by what they are made of.
+//! Merges the patches of one shape into parts, and describes each part by its faces and its
+//! boundaries.
 
 use super::{PatchGraph, Surface};
 use nalgebra::{Matrix3, SymmetricEigen};
@@ -16,7 +17,8 @@ struct Merge {
 
 impl Ord for Merge {
     fn cmp(&self, other: &Self) -> Ordering {
-        // BinaryHeap is a max-heap: the cheapest merge, then the lowest pair, comes first.
+        // BinaryHeap is a max-heap, so the order is reversed: the cheapest merge, then the lowest
+        // pair, comes first.
         other
             .cost
             .total_cmp(&self.cost)
@@ -35,13 +37,12 @@ impl PartialEq for Merge {
 }
 impl Eq for Merge {}
 
-/// Merges adjacent patches greedily until `n` regions are left, for each `n` in `sizes`, and
-/// returns the region of each patch for each of them, regions numbered in the order of their first
-/// patch.
+/// Merges adjacent patches greedily until `n` regions are left, for each `n` in `sizes`. Returns
+/// the region of each patch for each `n`, with regions numbered in the order of their first patch.
 ///
 /// The cost of a merge is Ward's (descriptor difference of `means (n_patches, dim)` weighted by
 /// area), times `exp(crease / 0.05)`, over the length of the common boundary relative to the
-/// smaller side. Where patches do not touch, more regions than asked for are left.
+/// smaller side. Where patches do not touch, more than `n` regions are left.
 ///
 /// ```
 /// use coseg_geometry::segmentation::{PatchGraph, merge_patches};
@@ -146,7 +147,8 @@ pub fn merge_patches(
     sizes
         .iter()
         .map(|n| {
-            // Too few merges possible: the coarsest there is; too few patches: the patches themselves.
+            // If no further merge is possible, the coarsest regions are used; if there are too few
+            // patches, the patches themselves.
             let at_least = snapshots
                 .range(n..)
                 .next()
@@ -195,7 +197,7 @@ fn numbered(region: &[u32]) -> Vec<u32> {
     region.iter().map(|r| number[r]).collect()
 }
 
-/// The parts of one shape: what each is made of, and the boundaries between them.
+/// The descriptors of the parts of one shape, and the boundaries between them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PartGraph {
     /// Area share of each part.
@@ -206,7 +208,7 @@ pub struct PartGraph {
     pub spread: Vec<f64>,
     /// Boundary-weighted mean of the neighbouring parts' means `(p, dim)`.
     pub context: Vec<f64>,
-    /// Size, proportions, boundary: [`PartGraph::N_SHAPE`] values a part.
+    /// Size, proportions and boundary: [`PartGraph::N_SHAPE`] values for each part.
     pub shape: Vec<f64>,
     /// Boundary length between parts `(p, p)`.
     pub boundary: Vec<f64>,
@@ -215,7 +217,7 @@ pub struct PartGraph {
 }
 
 impl PartGraph {
-    /// Values a part in `shape`.
+    /// Number of values for each part in `shape`.
     pub const N_SHAPE: usize = 11;
 
     /// Describes the parts of a shape, given the part of each patch and face descriptors `(m,
@@ -360,7 +362,7 @@ mod tests {
     use crate::mesh::{DualGraph, bridges, clean, zoo};
     use crate::segmentation::patches;
 
-    /// A valley of two sheets, its patches, and a descriptor that hardly differs from place to place.
+    /// A valley of two sheets, its patches, and a descriptor that is nearly constant.
     fn valley() -> (Surface, Vec<u32>, Vec<f32>) {
         let mut mesh = zoo::grid(40, 20);
         for p in &mut mesh.vertices {

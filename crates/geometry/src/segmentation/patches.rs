@@ -1,4 +1,4 @@
-//! A surface becomes about eighty patches: equally spread, and ending at creases.
+//! Divides a surface into about eighty patches that are equally spread and end at creases.
 //!
 //! Farthest-point seeds on the dual graph, where crossing a crease costs extra, then two Lloyd steps.
 //! Patches are the unit in which parts are found: their boundaries contain those of the parts.
@@ -6,12 +6,12 @@
 use crate::mesh::geodesic::Distances;
 use crate::mesh::{DualEdge, DualGraph, FaceGeometry, TriMesh, add, distance, scale};
 
-/// What crossing an edge adds for each radian of its angle, in lengths, where it is concave; people see
-/// parts end in concave creases (Hoffman and Richards 1984, *Parts of recognition*).
+/// Cost of crossing an edge for each radian of its angle, in lengths, where it is concave; people
+/// see parts end in concave creases (Hoffman and Richards 1984, *Parts of recognition*).
 const CREASE: f64 = 4.0;
-/// What a convex angle counts of a concave one.
+/// The weight of a convex angle relative to a concave one.
 const CONVEX: f64 = 0.15;
-/// Crossing a bridge: 1 + 3 × its length, more than any way within a component.
+/// Crossing a bridge costs 1 + 3 × its length, more than any path within a component.
 const BRIDGE: f64 = 1.0;
 const BRIDGE_FACTOR: f64 = 3.0;
 /// Keeps the cost of crossing an edge positive.
@@ -27,8 +27,8 @@ fn cost(edge: &DualEdge) -> f64 {
     (edge.distance + MIN_LENGTH) * (1.0 + CREASE * weight * edge.angle)
 }
 
-/// Patch of each face `(m,)` of a mesh of area 1, numbered without gaps by first face: at most
-/// `n_patches` (at least 1), fewer when there are fewer faces; empty without faces.
+/// Patch of each face `(m,)` of a mesh of area 1: at most `n_patches` (at least 1), numbered
+/// without gaps by first face; fewer when there are fewer faces, and empty without faces.
 ///
 /// The first seed is the face farthest from `start`, which is best an extremity
 /// ([`FaceDescriptors::farthest_start`](crate::descriptors::FaceDescriptors::farthest_start)).
@@ -74,7 +74,7 @@ pub fn patches(mesh: &TriMesh, dual: &DualGraph, start: u32, n_patches: usize) -
         });
         let next = farthest(&distances);
         let reached = distances.values[next as usize].is_finite();
-        // All seeds are taken when the farthest face is one.
+        // If the farthest face is already a seed, all faces are seeds.
         if distances.values[next as usize] <= 0.0 || (reached && seeds.len() >= n_patches.max(1)) {
             break;
         }
@@ -112,7 +112,7 @@ fn middles(geometry: &FaceGeometry, owner: &[u32], n_patches: usize) -> Vec<Opti
     best.into_iter().map(|(_, face)| face).collect()
 }
 
-/// The same patches, numbered by first face.
+/// The same patches, numbered without gaps by first face.
 fn without_gaps(owner: &[u32], n_patches: usize) -> Vec<u32> {
     let mut number = vec![u32::MAX; n_patches];
     let mut next = 0;

@@ -1,9 +1,9 @@
-//! A proxy mesh becomes the weighted dual graph on which faces are labelled.
+//! Builds the weighted dual graph of a proxy mesh, on which faces are labelled.
 
 use crate::mesh::{DualGraph, FaceGeometry, TriMesh, bridges};
 
-/// Weight of a convex crease against a concave one of the same angle: people cut along concavities
-/// (minima rule, Hoffman and Richards 1984).
+/// Weight of a convex crease relative to a concave one of the same angle: people cut along
+/// concavities (minima rule, Hoffman and Richards 1984).
 const CONVEX_WEIGHT: f64 = 0.1;
 /// Crease of a virtual edge between components: as good a place to cut as a sharp concave crease.
 const BRIDGE_CREASE: f64 = 0.3;
@@ -15,14 +15,15 @@ pub struct SurfaceEdge {
     pub faces: [u32; 2],
     /// Length of the shared edge; the mean edge length for a bridge.
     pub length: f64,
-    /// `η min(θ/π, 1)` with θ the angle between the normals and η = 0.1 convex, 1 concave: 0 flat, 1 folded.
+    /// `η min(θ/π, 1)` with θ the angle between the normals and η = 0.1 convex, 1 concave: 0 where
+    /// flat, 1 where folded.
     pub crease: f64,
     /// Cost of a label boundary here, 1 on a flat edge of mean length, falling with the crease:
     /// `(length / mean) (−ln crease) / ln 1000`, crease clipped to [1e-3, 1].
     pub boundary_cost: f64,
 }
 
-/// What labelling needs of a mesh.
+/// The data of a mesh that labelling uses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Surface {
     /// Share of the total area of each face `(m,)`; sums to 1.
@@ -51,7 +52,7 @@ impl Surface {
         Self::from_dual(&FaceGeometry::new(mesh), &DualGraph::new(mesh, &joins))
     }
 
-    /// The surface, where geometry and dual graph are there already.
+    /// Builds the surface from a geometry and a dual graph that the caller already has.
     ///
     /// ```
     /// use coseg_geometry::mesh::{DualGraph, FaceGeometry, icosphere};

@@ -1,4 +1,4 @@
-//! A stiffness and a mass become connected components, each in standard form.
+//! Splits a stiffness and a mass into connected components, each in standard form.
 
 use super::SpectrumError;
 use crate::linalg::basis::Basis;
@@ -55,16 +55,16 @@ impl Component {
         off_pivots(shift, |at| Factor::new(&self.analysis, &self.standard, at))
     }
 
-    /// Counts the eigenvalues of S below `shift`, moved as for [`Component::factor`]; a bound on the
-    /// perturbation below `enough` need not be sharp.
+    /// Counts the eigenvalues of S below `shift`, which moves as for [`Component::factor`]. The
+    /// bound on the perturbation need not be sharp once it is below `enough`.
     pub(super) fn inertia(&self, shift: f64, enough: f64) -> Result<(Inertia, f64), LdltError> {
         off_pivots(shift, |at| {
             Inertia::new(&self.analysis, &self.standard, at, enough)
         })
     }
 
-    /// Whether among the entries of an eigenvector of W of magnitude `most`, the largest, that of the
-    /// lowest vertex is negative. `vectors` are those of S.
+    /// Whether the lowest vertex among the entries of largest magnitude, `most`, of an eigenvector
+    /// of W has a negative entry. `vectors` are those of S.
     pub(super) fn first_extreme_is_negative(
         &self,
         vectors: &Basis,
@@ -138,7 +138,7 @@ impl Component {
     }
 }
 
-/// What [`Component::measure`] finds of the columns of a panel.
+/// The measurements of the columns of a panel, see [`Component::measure`].
 pub(super) struct Measured {
     pub(super) quotients: [f64; WIDTH],
     pub(super) residuals: [f64; WIDTH],
@@ -163,7 +163,7 @@ fn off_pivots<T>(
     unreachable!("the last attempt returns")
 }
 
-/// Memory of [`Component::measure`], for one panel after the other.
+/// Scratch memory of [`Component::measure`], reused for one panel after the other.
 #[derive(Default)]
 pub(super) struct Scratch {
     /// The panel.
@@ -199,7 +199,7 @@ pub(super) fn validate(stiffness: &sprs::CsMat<f64>, mass: &[f64]) -> Result<(),
         let row = stiffness.outer_view(i);
         row.expect("invariant: i is below the size of W")
     };
-    // Entries beyond the diagonal are met by their mirror images in their own order.
+    // Entries above the diagonal come in the order in which their mirror images need them.
     let mut waiting: Vec<usize> = (0..rows)
         .map(|i| view(i).indices().partition_point(|&c| c <= i))
         .collect();

@@ -1,5 +1,5 @@
-//! One connected component becomes its smallest eigenpairs, proved complete: densely if it is small
-//! or most of its spectrum is wanted.
+//! Computes the smallest eigenpairs of one connected component, proved complete: densely if it is
+//! small or most of its spectrum is wanted.
 
 use super::component::Component;
 use super::iterative::{Lanczos, first_dimension};
@@ -12,7 +12,7 @@ use crate::linalg::panel::{WIDTH, zero_panel};
 /// Components up to this size are solved densely.
 const DENSE_ALWAYS: usize = 160;
 
-/// Dense eigenvalues below minus this share of the largest are not rounding.
+/// Dense eigenvalues below minus this share of the largest one are too negative for rounding.
 const NEGATIVE: f64 = 1e-10;
 
 /// Eigenpairs of a component: all that lie below `limit`.
@@ -35,12 +35,12 @@ pub(super) struct Pairs {
     pub(super) growth: f64,
     /// Dimension of the Krylov space; 0 for a dense solve.
     pub(super) n_krylov: usize,
-    /// Rounds of inverse iteration and of looking for missing pairs.
+    /// Rounds of inverse iteration and of search for missing pairs.
     pub(super) n_polish: usize,
     pub(super) n_repair: usize,
 }
 
-/// What a solve needs besides the matrix.
+/// The parameters of a solve besides the matrix.
 pub(super) struct Setting<'a> {
     pub(super) tolerance: f64,
     pub(super) seed: u64,
@@ -62,18 +62,18 @@ pub(super) fn smallest(
     Lanczos { component, setting }.run(k)
 }
 
-/// A place between two eigenvalues.
+/// A limit between two eigenvalues.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Gap {
-    /// Pairs below.
+    /// Number of pairs below the limit.
     pub(super) count: usize,
     pub(super) limit: f64,
-    /// Distance from the limit to the last of them.
+    /// Distance from the limit to the last of these pairs.
     pub(super) margin: f64,
 }
 
-/// Where to put the limit when `values` are ascending: in the first gap at or after pair k that is
-/// not the inside of a cluster, and that has room for a margin above `least`, which is 0 as a rule.
+/// Chooses the limit for ascending `values`: in the first gap at or after pair k that lies outside
+/// a cluster and has room for a margin above `least`, which is usually 0.
 pub(super) fn gap_after(values: &[f64], k: usize, n: usize, least: f64) -> Option<Gap> {
     for j in k..=values.len() {
         if j == n {
@@ -86,7 +86,8 @@ pub(super) fn gap_after(values: &[f64], k: usize, n: usize, least: f64) -> Optio
         if j < values.len() {
             let gap = values[j] - values[j - 1];
             let mean_spacing = values[j] / (j + 1) as f64;
-            // Near the pair below, which is known best; in the middle where a wide margin is called for.
+            // The limit is near the pair below, whose value is the most accurate; where a wide
+            // margin is required, it is in the middle.
             let margin = match least > 0.0 {
                 true => 0.5 * gap,
                 false => 0.3 * gap.min(mean_spacing),
@@ -142,7 +143,8 @@ pub(super) fn dense(
         margin: f64::INFINITY,
     });
     let mut basis = Basis::new(n, j.div_ceil(WIDTH), setting.parallel);
-    // The null vector is known exactly: the others are made orthogonal to it, not to what came out.
+    // The null vector is known exactly, so the others are made orthogonal to it rather than to its
+    // approximation.
     let mut null = Basis::new(n, 1, setting.parallel);
     if component.has_null_vector {
         null.push(&zero_panel(n));

@@ -1,5 +1,5 @@
-//! Solved components become one spectrum, whose eigenvectors are copied out row by row, straight from
-//! where the solver left them.
+//! Combines solved components into one spectrum. Rows of its eigenvectors are copied straight out
+//! of the solver's memory.
 
 use super::component::Component;
 use super::connected::Pairs;
@@ -10,24 +10,25 @@ use nalgebra::DMatrix;
 use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator};
 use rayon::slice::ParallelSliceMut;
 
-/// A tiny eigenvalue of either sign is rounding of zero below this share of the largest one.
+/// A tiny eigenvalue of either sign counts as zero below this share of the largest one.
 const ZERO: f64 = 1e-12;
 
-/// Eigenvalues below minus this share of the largest one are not rounding.
+/// Eigenvalues below minus this share of the largest one are too negative for rounding.
 const NEGATIVE: f64 = 1e-6;
 
 /// Rows that a thread copies at a time.
 const ROWS: usize = 512;
 
-/// The smallest eigenpairs of `W φ = λ A φ`, the eigenvectors Φ `(n, k)` in the memory in which they
-/// were computed: [`Eigenpairs::rows`] writes rows of them where they are wanted, without a second copy.
+/// The smallest eigenpairs of `W φ = λ A φ`, with the eigenvectors Φ `(n, k)` in the memory in
+/// which they were computed. [`Eigenpairs::rows`] writes rows of them to their destination, without
+/// a second copy.
 #[derive(Debug)]
 pub struct Eigenpairs {
     /// `(k,)`, ascending, not negative.
     pub eigenvalues: Vec<f64>,
     /// `‖W φ - λ A φ‖` in the norm of `A⁻¹`, `(k,)`.
     pub residuals: Vec<f64>,
-    /// Why none is missing.
+    /// The proof that no eigenvalue is missing.
     pub certificate: Certificate,
     parts: Vec<Part>,
     /// The part and row of each vertex.
@@ -44,22 +45,22 @@ struct Part {
     panels: Vec<Panel>,
 }
 
-/// Where the columns of a panel go.
+/// The destination of the columns of a panel.
 #[derive(Debug)]
 struct Panel {
-    /// Which panel of the component's vectors.
+    /// Index of the panel in the component's vectors.
     source: usize,
-    /// The first `n` columns are columns `first..first + n` of Φ; elsewhere `scattered` tells.
+    /// The first `n` columns are columns `first..first + n` of Φ; the others are in `scattered`.
     first: usize,
     n: usize,
-    /// (column of the panel, column of Φ), where they do not follow each other.
+    /// (column of the panel, column of Φ), for columns that are not consecutive.
     scattered: Vec<(usize, usize)>,
-    /// 1, or -1 where the canonical sign is the other one.
+    /// The factors 1, or -1 where the canonical sign is the opposite.
     signs: [f64; WIDTH],
 }
 
 impl Eigenpairs {
-    /// As [`Spectrum::smallest`], with the eigenvectors where the solver left them.
+    /// Like [`Spectrum::smallest`], but leaves the eigenvectors in the solver's memory.
     ///
     /// ```
     /// use coseg_geometry::mesh::icosphere;
@@ -99,9 +100,9 @@ impl Eigenpairs {
         self.eigenvalues.len()
     }
 
-    /// Writes rows of Φ to `out`, row-major, from vertex `first` on: as many as `out` has multiples
-    /// of k. `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the first such) is
-    /// positive.
+    /// Writes rows of Φ to `out`, row-major, from vertex `first` on; the length of `out` divided by
+    /// k is the number of rows. `ΦᵀAΦ = I`; in each column the entry of largest magnitude (the
+    /// first such) is positive.
     ///
     /// ```
     /// use coseg_geometry::mesh::icosphere;
@@ -254,7 +255,7 @@ impl Eigenpairs {
             residuals.push(solved[c].residuals[i]);
             columns[c].push((i, to));
         }
-        // Values of a cluster, measured, need not be in the order in which the pairs were found.
+        // Measured values of a cluster may be in another order than the pairs.
         columns.iter_mut().for_each(|c| c.sort_unstable());
         let n = parts.iter().map(Component::n).sum();
         let mut places = vec![(0, 0); n];
@@ -286,14 +287,15 @@ impl Eigenpairs {
     }
 }
 
-/// The proof of the whole: the lowest limit is that of all, and the largest bound.
+/// The certificate of the whole spectrum: the lowest limit applies to all, and so does the largest
+/// bound.
 fn certificate(solved: &[Pairs], order: &[(f64, usize, usize)]) -> Certificate {
     let tightest = solved
         .iter()
         .min_by(|a, b| a.limit.total_cmp(&b.limit))
         .expect("invariant: k >= 1, so there is a component");
     let tau = tightest.limit;
-    // The component that comes nearest to failing its proof tells of it.
+    // The component nearest to failing its proof determines these figures.
     let weakest = solved
         .iter()
         .max_by(|a, b| (a.perturbation / a.margin).total_cmp(&(b.perturbation / b.margin)))

@@ -1,10 +1,10 @@
-//! Why there is no spectrum.
+//! The errors of a spectrum.
 
 use crate::linalg::block_lanczos::Exhausted;
 use crate::linalg::dense_eigen::DenseEigenError;
 use crate::linalg::ldlt::LdltError;
 
-/// Why there is no spectrum.
+/// The reason why a spectrum cannot be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SpectrumError {
     /// W is not square.
@@ -15,7 +15,7 @@ pub enum SpectrumError {
         /// Columns of W.
         columns: usize,
     },
-    /// The mass does not belong to W.
+    /// The mass has another length than W.
     #[error("mass has {n_mass} entries, but the stiffness has {n} rows")]
     MassLength {
         /// Entries of the mass.
@@ -28,7 +28,7 @@ pub enum SpectrumError {
         "the mass of vertex {vertex} is {value}, but must be positive, finite and not denormal"
     )]
     Mass {
-        /// Which vertex.
+        /// Index of the vertex.
         vertex: usize,
         /// Its mass.
         value: f64,
@@ -58,15 +58,15 @@ pub enum SpectrumError {
     /// W has negative eigenvalues.
     #[error("{count} eigenvalues lie below {below}, but the stiffness must be semidefinite")]
     NotSemidefinite {
-        /// How many.
+        /// Number of these eigenvalues.
         count: usize,
         /// A negative number.
         below: f64,
     },
-    /// More pairs were asked for than exist, or none.
-    #[error("{k} eigenpairs asked for, but the limits are 1 and {n}")]
+    /// The number of eigenpairs to compute is 0, or exceeds the dimension.
+    #[error("{k} eigenpairs were requested, but the limits are 1 and {n}")]
     Count {
-        /// Asked for.
+        /// Number of eigenpairs to compute.
         k: usize,
         /// Rows of W.
         n: usize,
@@ -74,15 +74,15 @@ pub enum SpectrumError {
     /// The tolerance is not usable.
     #[error("the tolerance is {tolerance}, but the limits are 1e-13 and 1e-2")]
     Tolerance {
-        /// As given.
+        /// The given tolerance.
         tolerance: f64,
     },
     /// The count of eigenvalues disagrees with the pairs found.
     #[error("{expected} eigenvalues lie below {tau}, but {found} were found")]
     Incomplete {
-        /// Where it was counted.
+        /// The limit of the count.
         tau: f64,
-        /// By inertia.
+        /// The count by inertia.
         expected: usize,
         /// Pairs found.
         found: usize,
@@ -90,15 +90,15 @@ pub enum SpectrumError {
     /// The Krylov space grew to its limit.
     #[error("{k} pairs have not converged in a Krylov space of {n_krylov} vectors, the limit")]
     NotConverged {
-        /// Wanted.
+        /// Number of pairs to compute.
         k: usize,
         /// Dimension of the Krylov space.
         n_krylov: usize,
     },
-    /// Everything above the k-th eigenvalue is one cluster, as far as was computed.
+    /// Everything above the k-th eigenvalue is one cluster, as far as it was computed.
     #[error("no gap was found above eigenvalue {k} among {n_krylov} approximations")]
     NoGap {
-        /// Asked for.
+        /// Number of pairs to compute.
         k: usize,
         /// Dimension of the Krylov space.
         n_krylov: usize,
@@ -106,25 +106,25 @@ pub enum SpectrumError {
     /// A residual stayed above the tolerance.
     #[error("eigenvalue {index} ({eigenvalue}) has residual {residual}, but the limit is {limit}")]
     Residual {
-        /// Which pair, from 0.
+        /// Index of the pair, from 0.
         index: usize,
         /// Its value.
         eigenvalue: f64,
         /// Its residual.
         residual: f64,
-        /// What was allowed.
+        /// The largest allowed residual.
         limit: f64,
     },
     /// Approximate eigenvectors became linearly dependent.
     #[error("{k} approximate eigenvectors are linearly dependent")]
     Dependent {
-        /// How many.
+        /// Number of vectors.
         k: usize,
     },
-    /// The stage hook said stop.
+    /// The progress hook cancelled the solve.
     #[error("cancelled in stage {stage}")]
     Cancelled {
-        /// Where.
+        /// The stage that was cancelled.
         stage: &'static str,
     },
     /// A factorisation failed.

@@ -1,5 +1,5 @@
-//! One connected component becomes its smallest eigenpairs by shifted block Lanczos, complete by
-//! inertia.
+//! Computes the smallest eigenpairs of one connected component by shifted block Lanczos; inertia
+//! proves that none is missing.
 
 use super::SpectrumError;
 use super::component::Component;
@@ -10,14 +10,15 @@ use crate::linalg::block_lanczos::{BlockLanczos, Projection};
 use crate::linalg::ldlt::{Factor, Inertia};
 use crate::linalg::panel::{Row, WIDTH, zero_panel};
 
-/// Rounds in which eigenvalues that the count says are missing are looked for.
+/// Rounds of search for eigenvalues that the count includes and the iteration missed.
 const MAX_REPAIR: usize = 12;
 
-/// A Krylov space that has grown to this many vectors for each pair wanted (and 1,600 more) will not
-/// converge: the spectrum is one cluster.
+/// A Krylov space with this many vectors for each wanted pair (and 1,600 more) will not converge:
+/// the spectrum is one cluster.
 const MOST_VECTORS: usize = 6;
 
-/// Where the bound on rounding is too large for a gap, a wider one is looked for among so many more pairs, and this share.
+/// Where the bound on rounding is too large for a gap, the search for a wider one includes this
+/// many more pairs, plus a share.
 const FURTHER_PAIRS: usize = 16;
 const FURTHER_SHARE: usize = 8;
 
@@ -29,14 +30,14 @@ const DENSE_AT_MOST: usize = 4_000;
 const FEWEST_BELOW: f64 = 0.5;
 const MOST_BELOW: f64 = 0.65;
 
-/// Vectors after which k pairs have usually converged to 1e-8, by experiment on surfaces. A second
-/// look at a space that is too small costs more than a few vectors too many.
+/// Number of vectors after which k pairs have usually converged to 1e-8, by experiment on surfaces.
+/// A second test of a space that is too small costs more than a few vectors too many.
 pub(super) fn first_dimension(k: usize) -> usize {
     (k * 31 / 20 + 96).next_multiple_of(WIDTH)
 }
 
-/// Blocks after which residuals that are `worst` times too large will do: each block divides them by
-/// `10^(2.9 k^-0.22)`, by experiment, on any surface.
+/// Number of blocks after which residuals that are `worst` times too large will suffice: each block
+/// divides them by `10^(2.9 k^-0.22)`, by experiment, on any surface.
 fn blocks_to_go(worst: f64, k: usize) -> usize {
     let per_block = 2.9 * (k as f64).powf(-0.22);
     (worst.max(1.0).log10() / per_block).ceil().min(1e3) as usize
@@ -59,7 +60,8 @@ impl Lanczos<'_> {
         usize::from(self.component.has_null_vector)
     }
 
-    /// A shift with about 0.6 of the k wanted eigenvalues below it: Weyl's law, corrected by counts.
+    /// A shift with about 0.6 of the k wanted eigenvalues below it, by Weyl's law corrected by
+    /// counts.
     fn interior_shift(&self, k: usize) -> Result<(Factor, f64), SpectrumError> {
         let k = k as f64;
         let weyl = 4.0 * std::f64::consts::PI * k / self.component.area;
@@ -78,7 +80,7 @@ impl Lanczos<'_> {
             } else {
                 low = at;
             }
-            // The count is about linear in the shift; safeguarded by bisection.
+            // The count is roughly linear in the shift; bisection is the safeguard.
             let aimed = shift * (0.58 * k / count.max(0.5)).clamp(0.02, 50.0);
             let bounded = high.is_finite() && low > 0.0;
             shift = match bounded {
@@ -104,7 +106,7 @@ impl Lanczos<'_> {
     pub(super) fn run(&self, k: usize) -> Result<Pairs, SpectrumError> {
         let n = self.component.n();
         let hook = &self.setting.hook;
-        // At least three pairs, so that a shift fits between them.
+        // At least three pairs are wanted, so that a shift fits between them.
         let (factor, shift) = self.interior_shift(k.max(3))?;
         let mut locked = Basis::new(n, 1, self.setting.parallel);
         if self.component.has_null_vector {
@@ -121,7 +123,7 @@ impl Lanczos<'_> {
             self.setting.parallel,
         )?;
         let mut target = first_dimension(k).min(capacity * WIDTH);
-        // A margin that a gap must have, once a bound turned out to be too large.
+        // The margin that a gap must have, after a bound turned out to be too large.
         let mut least = 0.0;
         let (ritz, projection, gap, counted) = loop {
             while space.dimension() < target {
@@ -222,7 +224,7 @@ impl Lanczos<'_> {
         Ritz { pairs }
     }
 
-    /// Largest residual of the first `count` pairs, in units of what is allowed.
+    /// Largest residual of the first `count` pairs, relative to the allowed one.
     fn worst(&self, ritz: &Ritz, count: usize) -> f64 {
         if ritz.pairs.len() < count {
             return f64::INFINITY;
@@ -244,7 +246,7 @@ impl Lanczos<'_> {
         gap_after(&values, k, self.component.n(), least)
     }
 
-    /// Compares the count of eigenvalues below the limit with the pairs found, and looks for
+    /// Compares the count of eigenvalues below the limit with the pairs found, and searches for
     /// missing ones in the orthogonal complement of those found.
     fn complete(
         &self,

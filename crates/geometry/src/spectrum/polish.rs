@@ -1,4 +1,4 @@
-//! Eigenpairs become eigenpairs with measured, small residuals.
+//! Measures the residuals of eigenpairs, and reduces those that are too large.
 
 // Small matrices and register tiles read best with their indices.
 #![allow(clippy::needless_range_loop)]
@@ -12,26 +12,26 @@ use crate::linalg::ldlt::Factor;
 use crate::linalg::panel::{Row, Tile, WIDTH, ZERO_TILE};
 use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 
-/// Pairs whose residuals are at most this share of what is allowed are left as they are.
+/// Pairs whose residuals are at most this share of the allowed one stay unchanged.
 const GOOD_ENOUGH: f64 = 0.7;
 
-/// So many pairs, or this share of all, are corrected one panel after the other.
+/// At most this many pairs, or this share of all, are corrected one panel after the other.
 const FEW: usize = 16;
 const FEW_OF: usize = 4;
 
 /// Inner products above this have squares that count.
 const SMALL_TURN: f64 = 1e-6;
 
-/// Eigenvalues within this ratio count as a cluster when errors are told apart.
+/// Eigenvalues within this ratio count as a cluster when errors are attributed.
 const CLUSTER: f64 = 1.5;
 
-/// Rounds of inverse iteration with a definite factor before a residual is given up.
+/// Rounds of inverse iteration with a definite factor before the solve fails for a residual.
 const MAX_POLISH: usize = 4;
 
-/// Measures the residuals. While one is too large, improves the worse ones: where they are few, by a
-/// correction with the `factor` at the interior shift, if there is one; where they are many, or that
-/// does not suffice, by inverse iteration with a definite factor (no growth, whatever the mesh) and a
-/// Rayleigh–Ritz step.
+/// Measures the residuals. While one is too large, improves the worse ones: where they are few, by
+/// a correction with the `factor` at the interior shift, if there is one; where they are many, or
+/// if that is not enough, by inverse iteration with a definite factor (no growth, whatever the
+/// mesh) and a Rayleigh–Ritz step.
 pub(super) fn verify_and_polish(
     component: &Component,
     setting: &Setting,
@@ -90,7 +90,7 @@ pub(super) fn verify_and_polish(
     }
 }
 
-/// Replaces the values by Rayleigh quotients, and measures the residuals, in the panels listed, in
+/// Replaces the values by Rayleigh quotients and measures the residuals, in the listed panels, in
 /// ascending order.
 fn measure(
     component: &Component,
@@ -129,13 +129,13 @@ fn measure(
     }
 }
 
-/// Corrects the pairs at `poor`, ascending: their residuals r, measured on W, are solved for, and what that has outside
-/// of the span of all pairs is subtracted.
+/// Corrects the pairs at `poor`, ascending. Solves for their residuals r, measured on W, and
+/// subtracts the component of the solution outside the span of all pairs.
 ///
-/// `x - (S - σ)⁻¹ r` is what a step of inverse iteration at σ makes of x, to first order in the error. But the
-/// rounding of the factor, which is what left x as it is, now acts on a correction of the size of r. Errors
-/// of x along eigenvectors far above σ, nearly all of them, vanish; those up to 2 σ may grow
-/// by half. Lengths and angles change by the square of the error.
+/// `x - (S - σ)⁻¹ r` equals a step of inverse iteration at σ from x, to first order in the error.
+/// But the rounding of the factor, which limits the accuracy of x, now acts on a correction of the
+/// size of r. Errors of x along eigenvectors far above σ, nearly all of them, vanish; those up to 2
+/// σ may grow by half. Lengths and angles change by the square of the error.
 fn correct(
     component: &Component,
     parallel: bool,
@@ -177,11 +177,11 @@ fn correct(
     }
 }
 
-/// The residuals in units of what is allowed, `tolerance · max(λ, λ₊)`.
+/// The residuals relative to the allowed ones, `tolerance · max(λ, λ₊)`.
 fn ratios(pairs: &Pairs, tolerance: f64) -> Vec<f64> {
     let largest = pairs.values.last().copied().unwrap_or(0.0);
     let positive = pairs.values.iter().copied().find(|&l| l > 1e-12 * largest);
-    // With zeros only, λ₊ is known to lie above the limit.
+    // If all values are zero, λ₊ is known to lie above the limit.
     let smallest = positive.unwrap_or(if pairs.limit.is_finite() {
         pairs.limit
     } else {
@@ -192,7 +192,7 @@ fn ratios(pairs: &Pairs, tolerance: f64) -> Vec<f64> {
         .collect()
 }
 
-/// The index of the largest ratio; one that is not a number counts as larger.
+/// The index of the largest ratio; NaN counts as larger.
 fn worst(ratios: &[f64]) -> usize {
     let key = |i: &usize| ratios[*i];
     (0..ratios.len())
@@ -200,7 +200,7 @@ fn worst(ratios: &[f64]) -> usize {
         .unwrap_or(0)
 }
 
-/// Improves the pairs at `poor`, ascending, and keeps all vectors orthonormal.
+/// Improves the pairs at `poor`, ascending, and preserves the orthonormality of all vectors.
 fn polish(
     component: &Component,
     parallel: bool,
@@ -222,9 +222,10 @@ fn polish(
     let mut y = Basis::new(n, n_panels, parallel);
     let null = component.has_null_vector;
     let values = &pairs.values;
-    // An inner product g of y ≈ φ_f and x ≈ φ_r, which should be 0, is an error of either. As
-    // (S - σ) y is in the span of X_f, yᵀ (S - σ) x = 0 says whose: y has (λ_f - σ) / (λ_f - λ_r) g
-    // of φ_r, and x the rest of φ_f. Within a cluster any basis will do; the null vector is exact.
+    // An inner product g of y ≈ φ_f and x ≈ φ_r, which should be 0, is an error of either. As (S -
+    // σ) y is in the span of X_f, yᵀ (S - σ) x = 0 attributes it: y contains (λ_f - σ) / (λ_f -
+    // λ_r) g of φ_r, and x contains the rest of φ_f. Within a cluster any basis will do; the null
+    // vector is exact.
     let separate = |g: f64, f: usize, r: usize| {
         let (low, high) = (values[f].min(values[r]), values[f].max(values[r]));
         if high <= CLUSTER * low || (null && r == 0) {
@@ -302,14 +303,15 @@ fn polish(
             row.0[to % WIDTH] = x.0[from % WIDTH];
         }
     }
-    // What was removed was right to first order.
+    // The removed components were right to first order.
     if largest_turn > SMALL_TURN {
         orthonormalise(&mut pairs.vectors, pairs.values.len());
     }
     Ok(())
 }
 
-/// `X ← X (3 I - XᵀX) / 2` for the first `k` columns: a Newton step to the nearest orthonormal ones.
+/// `X ← X (3 I - XᵀX) / 2` for the first `k` columns: a Newton step to the nearest orthonormal
+/// columns.
 fn orthonormalise(vectors: &mut Basis, k: usize) {
     let n_panels = vectors.n_panels();
     let mut coefficients = vec![vec![ZERO_TILE; n_panels]; n_panels];

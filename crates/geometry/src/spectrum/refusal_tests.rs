@@ -46,7 +46,8 @@ fn tells_how_far_it_is() {
         .into_iter()
         .filter(|p| p.stage == "iterate")
         .collect();
-    // One call a block, each with more vectors than the one before; the last ends the space.
+    // The hook is called once for each block, each time with more vectors; the last call ends the
+    // space.
     assert!(iterate.windows(2).all(|w| w[0].done < w[1].done));
     assert!(iterate.iter().all(|p| p.done < p.expected));
     let n_krylov = found.certificate.n_krylov;
@@ -64,7 +65,7 @@ fn refuses_what_has_no_spectrum() {
     let message = |e: SpectrumError| e.to_string();
     assert_eq!(
         message(of(&good.stiffness, &good.mass, 0)),
-        "0 eigenpairs asked for, but the limits are 1 and 42"
+        "0 eigenpairs were requested, but the limits are 1 and 42"
     );
     assert!(matches!(
         of(&good.stiffness, &good.mass, n + 1),

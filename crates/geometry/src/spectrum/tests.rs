@@ -4,7 +4,7 @@ use crate::operators::test_meshes::{bumpy_torus, copies, cube, icosphere, rectan
 use crate::operators::{Laplacian, Operator, laplacian};
 use std::f64::consts::{PI, TAU};
 
-/// What the module promises.
+/// The bound on the residuals that the module promises.
 const RESIDUAL: f64 = 1e-8;
 const ORTHONORMAL: f64 = 1e-10;
 
@@ -14,7 +14,7 @@ fn of(mesh: &TriMesh, k: usize) -> (Laplacian, Spectrum) {
     (operator, spectrum)
 }
 
-/// Solves and checks every promise that holds for any matrix.
+/// Solves and checks all properties that hold for any matrix.
 fn solved(operator: &Laplacian, k: usize) -> Spectrum {
     let options = Options::default();
     let spectrum = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options).unwrap();
@@ -33,7 +33,7 @@ fn check(operator: &Laplacian, k: usize, spectrum: &Spectrum) {
         .find(|&l| l > 0.0)
         .unwrap_or(1.0);
     for (j, &lambda) in spectrum.eigenvalues.iter().enumerate() {
-        // Independently of the solver, in plain arithmetic.
+        // This check is independent of the solver, in plain arithmetic.
         let mut squared = 0.0;
         for (i, row) in operator.stiffness.outer_iterator().enumerate() {
             let w: f64 = row.iter().map(|(c, w)| w * phi[(c, j)]).sum();
@@ -149,7 +149,8 @@ fn every_mesh_of_the_zoo_has_a_spectrum() {
                 let found = Spectrum::smallest(&operator.stiffness, &operator.mass, k, &options);
                 let found = match found {
                     Ok(found) => found,
-                    // Weights of slivers, which the default does not have, can be beyond double precision.
+                    // Weights of slivers, which the default operator does not have, may exceed
+                    // double precision.
                     Err(e) => {
                         assert_ne!(kind, Operator::Tufted, "{name}: {e}");
                         assert!(matches!(e, SpectrumError::Residual { .. }), "{name}: {e}");
@@ -159,7 +160,7 @@ fn every_mesh_of_the_zoo_has_a_spectrum() {
                 check_form(&operator, k, &found);
                 let proved = found.certificate.proved();
                 assert!(proved || kind != Operator::Tufted, "{name}: {found:?}");
-                // As measured on differences: in plain sums such weights cancel.
+                // Values are measured on differences, since such weights cancel in plain sums.
                 let positive = found.eigenvalues.iter().copied().find(|l| *l > 0.0);
                 let tau = found.certificate.tau;
                 let scale = positive.unwrap_or(if tau.is_finite() { tau } else { 1.0 });
@@ -219,7 +220,7 @@ fn rectangle_has_neumann_eigenvalues() {
 
 #[test]
 fn a_matrix_without_null_vector() {
-    // Dirichlet conditions: the diagonal alone is larger.
+    // Dirichlet conditions make the diagonal alone larger.
     let (mut operator, exact) = flat_torus(40, 40);
     let shift = 17.0;
     let mut triplets = sprs::TriMat::new(operator.stiffness.shape());
@@ -269,7 +270,7 @@ fn invariant_under_rotation_renumbering_and_scaling() {
     let (_, other) = of(&renumbered, k);
     assert_close(&other.eigenvalues, &reference.eigenvalues, 1e-9);
     for j in 0..10 {
-        // Simple eigenvalues: the same vectors, canonical signs included.
+        // Simple eigenvalues have the same vectors, including canonical signs.
         for v in 0..n {
             let (a, b) = (
                 reference.eigenvectors[(v as usize, j)],
@@ -326,9 +327,9 @@ fn bridged_components_are_one_domain_with_near_multiplicities() {
         1
     );
     // The spectrum of the parts is barely disturbed.
-    let apart = of(&mesh, 200).1;
-    for (a, b) in apart.eigenvalues.iter().zip(&spectrum.eigenvalues) {
-        assert!((a - b).abs() <= 0.02 * apart.eigenvalues[60], "{a} {b}");
+    let separate = of(&mesh, 200).1;
+    for (a, b) in separate.eigenvalues.iter().zip(&spectrum.eigenvalues) {
+        assert!((a - b).abs() <= 0.02 * separate.eigenvalues[60], "{a} {b}");
     }
 }
 
@@ -363,7 +364,7 @@ fn icosphere_is_complete_for_1000_seeds() {
 
 #[test]
 fn one_cluster_is_solved_densely() {
-    // The complete graph: 0 once, n for all the rest.
+    // The complete graph has the eigenvalue 0 once, and n in all other places.
     let n = 300;
     let mut triplets = sprs::TriMat::new((n, n));
     for i in 0..n {
@@ -415,7 +416,7 @@ fn cubes_have_their_symmetric_clusters() {
 
 #[test]
 fn slivers_stay_accurate() {
-    // Columns of vertices moved next to each other: triangles 10⁵ times longer than wide.
+    // Columns of vertices move close together, so triangles are 10⁵ times longer than wide.
     let mut mesh = bumpy_torus(60, 30);
     for i in (0..60).step_by(6) {
         for j in 0..30 {
@@ -484,7 +485,7 @@ fn few_pairs_of_a_large_mesh() {
 
 #[test]
 fn rows_are_those_of_the_matrix() {
-    // One component, whose columns follow each other, and several, whose columns alternate.
+    // One component has consecutive columns; several components have alternating ones.
     for mesh in [bumpy_torus(40, 30), copies(&bumpy_torus(12, 8), 3)] {
         let operator = laplacian(&mesh, &[], Operator::Tufted).unwrap();
         let (w, a, k, options) = (&operator.stiffness, &operator.mass, 45, Options::default());
@@ -514,7 +515,8 @@ fn rows_are_those_of_the_matrix() {
 fn a_count_that_rounding_might_change_is_not_called_a_proof() {
     let mut operator = laplacian(&bumpy_torus(40, 30), &[], Operator::Tufted).unwrap();
     assert!(solved(&operator, 40).certificate.proved());
-    // A vertex of next to no mass: the matrix in standard form has an entry that swallows all others.
+    // A vertex has almost no mass, so one entry of the matrix in standard form dominates all
+    // others.
     operator.mass[17] *= 1e-13;
     let options = Options {
         tolerance: 1e-5,

@@ -1,4 +1,4 @@
-//! L D Lᵀ is laid out for solves that take a panel of 8 right-hand sides at a time.
+//! Stores L D Lᵀ in a layout for solves of a panel of 8 right-hand sides at a time.
 
 use super::super::panel::{Row, WIDTH, add_scaled, load, store};
 use super::inertia::negative_pivots;
@@ -6,7 +6,7 @@ use super::{Analysis, LdltError, SymmetricSparse, diagonal_pivots, factorised};
 use faer::sparse::linalg::cholesky::supernodal::SupernodalLdltRef;
 use pulp::{Arch, Simd, WithSimd};
 
-/// Columns of L that a solve handles together; [`Block::width`] of them.
+/// The columns of L that a solve handles together; there are [`Block::width`] of them.
 #[derive(Debug, Clone, Copy)]
 struct Block {
     column: usize,
@@ -25,7 +25,7 @@ const MAX_BLOCK: usize = 6;
 /// `P (S - σI) Pᵀ = L D Lᵀ`, ready for panel solves.
 #[derive(Debug)]
 pub struct Factor {
-    /// Negative pivots: eigenvalues below the shift, but for rounding.
+    /// Number of negative pivots: of eigenvalues below the shift, up to rounding.
     pub n_negative: usize,
     blocks: Vec<Block>,
     rows: Vec<u32>,
@@ -57,8 +57,8 @@ impl Factor {
     /// ```
     ///
     /// # Errors
-    /// A pivot that is zero: the shift is an eigenvalue of a leading block; another one nearby is
-    /// not.
+    /// If a pivot is zero: the shift is an eigenvalue of a leading block, and another shift nearby
+    /// is not.
     pub fn new(
         analysis: &Analysis,
         matrix: &SymmetricSparse,

@@ -1,11 +1,12 @@
-//! The signs of the pivots of L D Lᵀ become a count of eigenvalues, with a bound on what rounding can do to it.
+//! Counts eigenvalues by the signs of the pivots of L D Lᵀ, with a bound on the effect of rounding.
 //!
-//! What is counted are the eigenvalues of `M + E`, `M = S - σI`, with `|E| ≤ G`, entry by entry,
-//! `G_ij = √(γ_i γ_j) (|L| |D| |Lᵀ|)_ij`, where `γ_i` is the unit roundoff times the operations that
-//! row i of L takes part in (Higham, *Accuracy and Stability of Numerical Algorithms*, 2002, theorem 10.3,
-//! which holds for D of any sign and any order of summation). G is symmetric and not negative, so its
-//! norm is at most `max (G x)_i / x_i` for any positive x (Collatz and Wielandt), and a few steps of
-//! the power method find an x for which that is nearly the norm: no growth of pivots goes unseen.
+//! The count is that of the eigenvalues of `M + E`, `M = S - σI`, with `|E| ≤ G`, entry by entry,
+//! `G_ij = √(γ_i γ_j) (|L| |D| |Lᵀ|)_ij`, where `γ_i` is the unit roundoff times the number of
+//! operations on row i of L (Higham, *Accuracy and Stability of Numerical Algorithms*, 2002,
+//! theorem 10.3, which holds for D of any sign and any order of summation). G is symmetric and not
+//! negative, so its norm is at most `max (G x)_i / x_i` for any positive x (Collatz and Wielandt),
+//! and a few steps of the power method find an x for which the bound is nearly the norm. Hence
+//! every growth of pivots is seen.
 
 use super::{Analysis, LdltError, SymmetricSparse, diagonal_pivots, factorised};
 use faer::sparse::linalg::cholesky::supernodal::SupernodalLdltRef;
@@ -13,7 +14,8 @@ use faer::sparse::linalg::cholesky::supernodal::SupernodalLdltRef;
 /// Half the distance from 1 to the next number.
 const ROUNDOFF: f64 = 0.5 * f64::EPSILON;
 
-/// Roundings of an entry besides those of its sum: of the product, of the pivot's reciprocal, of their product.
+/// Roundings of an entry besides those of its sum: of the product, of the pivot's reciprocal, and
+/// of their product.
 const FURTHER: f64 = 4.0;
 
 /// Roundings of an entry of S, which is an entry of W over the root of two masses.
@@ -22,7 +24,7 @@ const STANDARDISED: f64 = 4.0;
 /// Steps of the power method, each as cheap as a solve, after which the bound hardly improves.
 const MAX_STEPS: usize = 12;
 
-/// What the sums of the bound itself may lose.
+/// Factor for the rounding of the sums in the bound itself.
 const SLACK: f64 = 1.0 + 1e-6;
 
 /// How many eigenvalues lie below a shift.
@@ -32,8 +34,8 @@ pub struct Inertia {
     pub n_negative: usize,
     /// Bound on the 2-norm of the perturbation that the factorisation amounts to.
     pub perturbation: f64,
-    /// Growth of the pivots: the largest row sum of `|L| |D| |Lᵀ|` over that of `|S - σI|`. About
-    /// the length of a row where the matrix is definite.
+    /// Growth of the pivots: the largest row sum of `|L| |D| |Lᵀ|` over that of `|S - σI|`. It is
+    /// about the length of a row where the matrix is definite.
     pub growth: f64,
 }
 
@@ -58,8 +60,8 @@ impl Inertia {
     /// ```
     ///
     /// # Errors
-    /// A pivot that is zero: the shift is an eigenvalue of a leading block; another one nearby is
-    /// not.
+    /// If a pivot is zero: the shift is an eigenvalue of a leading block, and another shift nearby
+    /// is not.
     pub fn new(
         analysis: &Analysis,
         matrix: &SymmetricSparse,
@@ -89,7 +91,7 @@ impl Inertia {
     }
 }
 
-/// Counts negative pivots; refuses those that are zero or no numbers.
+/// Counts negative pivots; returns an error for a pivot that is zero or not finite.
 pub(super) fn negative_pivots(numeric: &SupernodalLdltRef<u32, f64>) -> Result<usize, LdltError> {
     let symbolic = numeric.symbolic();
     let n = symbolic.nrows();
@@ -160,7 +162,8 @@ fn perturbation(numeric: &SupernodalLdltRef<u32, f64>, enough: f64) -> (f64, f64
         if !bound.is_finite() || bound < enough || bound > 0.95 * before {
             break;
         }
-        // Rows of far smaller norm than the whole need no precise x, and must not come near zero.
+        // Rows of far smaller norm than the whole matrix need no precise x, and their x must not
+        // come near zero.
         for (x, y) in x.iter_mut().zip(&image) {
             *x = (y / largest).max(1e-9);
         }
@@ -168,7 +171,7 @@ fn perturbation(numeric: &SupernodalLdltRef<u32, f64>, enough: f64) -> (f64, f64
     (bound, products)
 }
 
-/// `|L| |D| |Lᵀ| x`, each column of L read once.
+/// `|L| |D| |Lᵀ| x`; reads each column of L once.
 fn absolute_product(numeric: &SupernodalLdltRef<u32, f64>, x: &[f64], out: &mut [f64]) {
     out.fill(0.0);
     let symbolic = numeric.symbolic();

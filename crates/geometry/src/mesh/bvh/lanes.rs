@@ -1,12 +1,12 @@
-//! The tests that searches are made of, of eight boxes or four triangles at a time.
+//! Provides the tests of the searches, on eight boxes or four triangles at a time.
 //!
-//! Written twice, because compilers do not find the instructions by themselves: with those of AVX where
-//! the processor has them, and without. Both do the same operations in the same order, so results are
-//! the same bits.
+//! Each is written twice, with AVX instructions for processors that have them and without, because
+//! compilers do not find the instructions by themselves. Both versions do the same operations in
+//! the same order, so results are the same bits.
 
 use super::wide::{Block, LANES, WIDTH, Wide};
 
-/// Rays of a fan.
+/// Number of rays of a fan.
 pub(super) const FAN: usize = 32;
 
 /// Rays from one point, in single precision.
@@ -14,12 +14,13 @@ pub(super) const FAN: usize = 32;
 pub(super) struct Fan {
     /// Reciprocals of the directions.
     pub(super) inverse: [[f32; 3]; FAN],
-    /// How far each ray is followed, in its direction's units; negative where there is no ray.
+    /// The length to which each ray is followed, in units of its direction; negative if there is no
+    /// ray.
     pub(super) limits: [f32; FAN],
 }
 
 impl Fan {
-    /// Of at most [`FAN`] directions.
+    /// Builds a fan of at most [`FAN`] directions.
     pub(super) fn new(directions: &[[f64; 3]]) -> Self {
         let mut fan = Self {
             inverse: [[1.0; 3]; FAN],
@@ -27,7 +28,8 @@ impl Fan {
         };
         for (i, direction) in directions.iter().enumerate() {
             fan.limits[i] = f32::INFINITY;
-            // A ray along an axis: a reciprocal that is huge, but 0 times it is 0 and not NaN.
+            // The reciprocal of a ray along an axis is huge but finite, so that 0 times it is 0 and
+            // not NaN.
             fan.inverse[i] = direction.map(|x| {
                 if x.abs() < 1e-30 {
                     1e30
@@ -40,20 +42,20 @@ impl Fan {
     }
 }
 
-/// The tests; each gives numbers, and a bit for each lane in which they count.
+/// The tests. Each returns numbers, and a bit for each lane whose number is valid.
 pub(super) trait Tests: Copy {
     /// The planes of a node as seen from a point.
     fn planes_from(self, point: [f32; 3], node: &Wide) -> [[f32; WIDTH]; 6];
 
-    /// Which of eight boxes a ray enters before `limit`; `planes` are theirs, as seen from its origin, and
-    /// `inverse` the reciprocals of its direction.
+    /// The boxes, of eight, that a ray enters before `limit`; `planes` are theirs, relative to its
+    /// origin, and `inverse` has the reciprocals of its direction.
     fn enters(self, planes: &[[f32; WIDTH]; 6], inverse: [f32; 3], limit: f32) -> u32;
 
-    /// Which rays of a fan are followed farther than `bound`.
+    /// The rays of a fan that are followed farther than `bound`.
     fn beyond(self, fan: &Fan, bound: f32) -> u32;
 
-    /// Lower bounds of the squared distances from a point to eight boxes, and which are at most `limit`.
-    /// Coordinates of the point are uncertain by `slack`.
+    /// Lower bounds of the squared distances from a point to eight boxes, and the boxes for which
+    /// they are at most `limit`. Coordinates of the point are uncertain by `slack`.
     fn squares(
         self,
         point: [f32; 3],
@@ -62,12 +64,12 @@ pub(super) trait Tests: Copy {
         limit: f32,
     ) -> ([f32; WIDTH], u32);
 
-    /// Distances along a ray to four triangles, and which are met, from either side (Möller and Trumbore
-    /// 1997, *Fast, Minimum Storage Ray/Triangle Intersection*).
+    /// Distances along a ray to four triangles, and the triangles that it meets, from either side
+    /// (Möller and Trumbore 1997, *Fast, Minimum Storage Ray/Triangle Intersection*).
     fn hits(self, origin: [f64; 3], direction: [f64; 3], block: &Block) -> ([f64; LANES], u32);
 }
 
-/// Without instructions that some processors lack.
+/// The version for all processors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Portable;
 
@@ -77,7 +79,7 @@ impl Tests for Portable {
     }
 
     fn enters(self, planes: &[[f32; WIDTH]; 6], inverse: [f32; 3], limit: f32) -> u32 {
-        // Comparisons rather than `min` and `max`: nothing is NaN here.
+        // Comparisons rather than `min` and `max`, since no value is NaN here.
         let lesser = |a: f32, b: f32| if a < b { a } else { b };
         let greater = |a: f32, b: f32| if a > b { a } else { b };
         let enters = |i: usize| {

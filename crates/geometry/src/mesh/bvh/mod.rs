@@ -1,8 +1,10 @@
-//! A box tree over the faces of a mesh answers which face is nearest to a point or first on a ray.
+//! Finds the nearest face to a point and the first face on a ray by a box tree over the faces of a
+//! mesh.
 //!
-//! Built by binned surface-area splits (Wald 2007, *On fast Construction of SAH-based Bounding Volume
-//! Hierarchies*), then widened to eight children a node (Wald, Benthin and Boulos 2008, *Getting Rid of
-//! Packets*): eight boxes are tested at once in single precision, four triangles in double.
+//! The tree is built by binned surface-area splits (Wald 2007, *On fast Construction of SAH-based
+//! Bounding Volume Hierarchies*), then widened to eight children for each node (Wald, Benthin and
+//! Boulos 2008, *Getting Rid of Packets*): eight boxes are tested at once in single precision, four
+//! triangles in double.
 
 mod lanes;
 mod nearest;
@@ -17,18 +19,19 @@ use wide::{Block, LANES, Wide};
 const LEAF_FACES: usize = 2;
 /// Candidate split planes along the widest axis.
 const N_BINS: usize = 12;
-/// At this depth nodes stay leaves, whatever their size: coincident faces cannot be told apart.
+/// At this depth nodes stay leaves, whatever their size: coincident faces cannot be separated.
 const MAX_DEPTH: usize = 62;
-/// More than what rounding a coordinate to single precision changes, and a distance between such points.
+/// An upper bound on the effect of single precision on a coordinate, and on a distance between such
+/// points.
 const ROUNDING: f32 = 1e-6;
 
 #[derive(Debug, Clone, Copy)]
 struct Node {
     low: [f64; 3],
     high: [f64; 3],
-    /// Leaf: first of its faces in `order`. Inner: left child; the right one follows it.
+    /// Leaf: its first face in `order`. Inner node: its left child, which the right one follows.
     first: u32,
-    /// Faces of a leaf; 0 for an inner node.
+    /// Number of faces of a leaf; 0 for an inner node.
     count: u32,
 }
 
@@ -36,27 +39,27 @@ struct Node {
 #[derive(Debug, Clone)]
 pub struct Bvh {
     nodes: Vec<Wide>,
-    /// Faces in leaf order, four and four.
+    /// Faces in leaf order, in blocks of four.
     blocks: Vec<Block>,
-    /// For each face four times its block, plus its lane there.
-    place: Vec<u32>,
+    /// For each face four times the index of its block, plus its lane in the block.
+    slot: Vec<u32>,
 }
 
-/// The memory that a search takes; reusable for the next.
+/// The memory of a search, reusable for the next one.
 #[derive(Debug, Clone, Default)]
 pub struct Search {
     stack: Vec<Entry>,
     fans: Vec<FanEntry>,
 }
 
-/// What is still to be visited.
+/// An entry of the stack of nodes to visit.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     /// A node, or the first block of a leaf.
     first: u32,
     /// Blocks of a leaf; 0 for a node.
     count: u32,
-    /// A lower bound of what is to be found there.
+    /// A lower bound of the distances inside it.
     bound: f32,
 }
 
@@ -69,7 +72,8 @@ impl Entry {
 }
 
 impl Search {
-    /// Puts the children of `node` that `mask` names on the stack, the one of least bound on top.
+    /// Pushes the children of `node` that `mask` selects on the stack, the one with the least bound
+    /// on top.
     #[inline(always)]
     fn push(&mut self, node: &Wide, bounds: &[f32; wide::WIDTH], mut mask: u32) {
         let base = self.stack.len();
@@ -128,7 +132,7 @@ struct Builder {
 }
 
 impl Builder {
-    /// Where to split `order[start..end]`, after reordering it; `None` for a leaf.
+    /// Chooses the split of `order[start..end]` and reorders it; `None` for a leaf.
     fn split(&mut self, start: usize, end: usize, all: &Bounds) -> Option<usize> {
         if end - start <= LEAF_FACES {
             return None;
@@ -169,7 +173,7 @@ impl Builder {
                 best = (cost, i);
             }
         }
-        // A flat box costs nothing wherever it is cut; then halve.
+        // A flat box has no area, so all cuts cost the same; it is halved.
         if !best.0.is_finite() || all.half_area() <= 0.0 {
             let c = &self.centers;
             self.order[start..end].select_nth_unstable_by(middle - start, |&a, &b| {
@@ -269,24 +273,24 @@ impl Bvh {
             nodes: Vec::new(),
         };
         builder.build();
-        let mut place = vec![0; mesh.faces.len()];
+        let mut slot = vec![0; mesh.faces.len()];
         let (nodes, blocks) = wide::widen(&builder, mesh);
         for (at, &face) in (0_u32..).zip(blocks.iter().flat_map(|b| &b.faces)) {
-            if let Some(place) = place.get_mut(face as usize) {
-                *place = at;
+            if let Some(slot) = slot.get_mut(face as usize) {
+                *slot = at;
             }
         }
         Self {
             nodes,
             blocks,
-            place,
+            slot,
         }
     }
 
     /// Corner of a face and the two edges from it.
     fn triangle(&self, face: u32) -> [[f64; 3]; 3] {
-        let place = self.place[face as usize] as usize;
-        self.blocks[place / LANES].triangle(place % LANES)
+        let slot = self.slot[face as usize] as usize;
+        self.blocks[slot / LANES].triangle(slot % LANES)
     }
 }
 

@@ -1,4 +1,4 @@
-//! The face nearest to a point.
+//! Finds the face nearest to a point.
 
 use super::lanes::{Portable, Tests};
 use super::wide::LANES;
@@ -24,8 +24,8 @@ impl Bvh {
     }
 
     /// The face with the least `distance to point + extra(face)`, and that sum; `None` when no sum
-    /// is below `limit`. `extra` is never negative. Of equal faces the first met, which is the same
-    /// in every run.
+    /// is below `limit`. `extra` must not be negative. Of equal faces it returns the first in the
+    /// order of the search, which is the same in every run.
     ///
     /// ```
     /// use coseg_geometry::mesh::{Bvh, FaceGeometry, Search, icosphere};
@@ -132,7 +132,7 @@ impl<F: Fn(u32) -> f64, T: Tests> NullaryFnOnce for Nearest<'_, F, T> {
     }
 }
 
-/// What squares of distances to boxes are compared with: rounded up.
+/// The limit that squared distances to boxes are compared with: rounded up.
 #[inline(always)]
 fn to_square(distance: f64) -> f32 {
     (distance * distance) as f32 * (1.0 + 4.0 * ROUNDING)

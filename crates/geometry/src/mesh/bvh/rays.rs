@@ -1,8 +1,8 @@
-//! The first face on each of many rays from one point: eight boxes at a time, in single precision, then
-//! four triangles in double.
+//! Finds the first face on each of many rays from one point: eight boxes at a time, in single
+//! precision, then four triangles in double.
 //!
-//! Rays from one point meet mostly the same boxes at first. Followed together, they share the way through
-//! the tree, and with it the branches that no processor can foresee.
+//! Rays from one point mostly meet the same boxes at first. Followed together, they share the path
+//! through the tree, and its branches, which no processor can predict.
 
 use super::ROUNDING;
 use super::lanes::{FAN, Fan, Portable, Tests};
@@ -11,10 +11,10 @@ use super::{Bvh, Search};
 use pulp::NullaryFnOnce;
 
 impl Bvh {
-    /// For each of several rays from `origin` the distance along its direction to the first face it
-    /// meets, from either side, other than face `except`; infinite when it meets none. Directions
-    /// have length 1, or less: then distances are in units of it. Rays are quickest in the order of
-    /// their directions.
+    /// For each of several rays from `origin`, the distance along its direction to the first face
+    /// that it meets, from either side, other than face `except`; infinite when it meets none.
+    /// Directions have length 1, or less; then distances are in units of that length. Rays are
+    /// fastest in the order of their directions.
     ///
     /// ```
     /// use coseg_geometry::mesh::{Bvh, Search, icosphere};
@@ -75,14 +75,14 @@ struct Cast<'a, T> {
     tests: T,
 }
 
-/// What is still to be visited by some rays.
+/// An entry of the stack of nodes that some rays must visit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FanEntry {
     /// A node, or the first block of a leaf.
     first: u32,
     /// Blocks of a leaf; 0 for a node.
     count: u32,
-    /// No point of it is nearer to the origin.
+    /// A lower bound of the distances of its points from the origin.
     bound: f32,
     active: u32,
 }
@@ -136,7 +136,8 @@ impl<T: Tests> NullaryFnOnce for Cast<'_, T> {
                     continue;
                 }
                 let node = &tree.nodes[entry.first as usize];
-                // Few rays are together beyond the first nodes: each against all children at once.
+                // Beyond the first nodes few rays are together, so each is tested against all
+                // children at once.
                 let planes = tests.planes_from(single, node);
                 let mut going = [0_u32; WIDTH];
                 let mut children = 0;
@@ -166,7 +167,7 @@ impl<T: Tests> NullaryFnOnce for Cast<'_, T> {
                         bound,
                         active: going[child],
                     });
-                    // Insertion: the nearest on top.
+                    // Inserted in order, with the nearest on top.
                     let mut at = search.fans.len() - 1;
                     while at > base && search.fans[at - 1].bound < bound {
                         search.fans.swap(at, at - 1);
@@ -196,7 +197,7 @@ mod tests {
         for t in &lengths {
             assert!((t - radius).abs() < 0.02 * radius, "{t} against {radius}");
         }
-        // In the units of the direction.
+        // Distances are in units of the direction.
         let shorter = directions.map(|d| scale(d, 0.5));
         let whole = lengths.clone();
         bvh.cast(&mut search, [0.0; 3], &shorter, u32::MAX, &mut lengths);

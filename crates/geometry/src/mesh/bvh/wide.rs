@@ -1,13 +1,13 @@
-//! The binary tree becomes one of eight children a node, its leaves blocks of four triangles.
+//! Widens the binary tree to eight children for each node, with blocks of four triangles as leaves.
 
 use super::{Bounds, Builder};
 use crate::mesh::{TriMesh, sub};
 
-/// Children of a node.
+/// Number of children of a node.
 pub(super) const WIDTH: usize = 8;
-/// Triangles of a block.
+/// Number of triangles of a block.
 pub(super) const LANES: usize = 4;
-/// Stands for no face where a block is not full.
+/// Marks a lane without face in a block that is not full.
 const NO_FACE: u32 = u32::MAX;
 /// Padding of single-precision boxes, relative to the largest coordinate.
 const PADDING: f64 = 1e-6;
@@ -15,20 +15,21 @@ const PADDING: f64 = 1e-6;
 /// Eight boxes side by side.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wide {
-    /// Low x, high x, low y, …, by child; padded, so that rounding to single precision loses nothing.
+    /// Low x, high x, low y, …, by child; padded, so that rounding to single precision never
+    /// shrinks a box.
     pub(super) planes: [[f32; WIDTH]; 6],
-    /// Leaf: first block. Inner: its node.
+    /// Leaf: its first block. Inner child: its node.
     pub(super) first: [u32; WIDTH],
     /// Blocks of a leaf; 0 for an inner child.
     pub(super) count: [u32; WIDTH],
-    /// A bit for each child there is.
+    /// A bit for each child that exists.
     pub(super) children: u32,
 }
 
 /// Four triangles side by side.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Block {
-    /// By coordinate and lane, as the edges; all zero where there is no face.
+    /// By coordinate and lane, like the edges; all zero in a lane without face.
     pub(super) corner: [[f64; LANES]; 3],
     /// From the corner to the next.
     pub(super) ab: [[f64; LANES]; 3],
@@ -89,7 +90,7 @@ pub(super) fn widen(binary: &Builder, mesh: &TriMesh) -> (Vec<Wide>, Vec<Block>)
     while let Some((node, at)) = todo.pop() {
         let mut members = vec![node];
         while members.len() < WIDTH {
-            // The largest box is the one most often met: open it.
+            // The largest box is the one that rays meet most often, so it is opened.
             let open = (0..members.len()).filter(|&i| !leaf(members[i]));
             let area = |i: usize| bounds(members[i]).half_area();
             let Some(i) = open.reduce(|a, b| if area(b) > area(a) { b } else { a }) else {

@@ -1,4 +1,4 @@
-//! The first bytes of a file that cannot be read say what it is: an archive, a picture, a mesh of
+//! Recognises a file that cannot be read by its first bytes: an archive, a picture, a mesh of
 //! another format, or a pointer to a file that was not fetched.
 
 use super::{Format, ParseError, as_utf8};
@@ -8,7 +8,7 @@ const EXPORT: &str = "export it from the program that made it";
 const NO_MESH: &str = "it holds no mesh";
 const POINTER: &str = "get the file itself with `git lfs pull`";
 
-/// Beginnings of files that are no meshes, or meshes of formats that are not supported.
+/// Beginnings of files that are not meshes, or meshes of formats that are not supported.
 const BEGINNINGS: [(&[u8], &str, &str); 34] = [
     (
         b"PK\x03\x04",
@@ -54,7 +54,7 @@ const BEGINNINGS: [(&[u8], &str, &str); 34] = [
     (b"DRACO", "a Draco mesh", EXPORT),
 ];
 
-/// That a file is something else than its name says, if its first bytes show what.
+/// The error for a file whose first bytes show another kind than its name says.
 pub(super) fn of(bytes: &[u8], wanted: Format) -> Option<ParseError> {
     let found = BEGINNINGS
         .iter()
@@ -77,7 +77,7 @@ pub(super) fn of(bytes: &[u8], wanted: Format) -> Option<ParseError> {
     })
 }
 
-/// What to do, with the formats to choose from where that helps.
+/// The advice of the message, with the supported formats where that helps.
 fn instead_of(what: &str) -> String {
     match what {
         POINTER => what.to_owned(),
@@ -96,7 +96,7 @@ fn title(format: Format) -> &'static str {
     }
 }
 
-/// The supported format that a text or a binary file begins like. OBJ has no header.
+/// The supported format whose beginning a text or a binary file has. OBJ has no header.
 fn supported(text: &[u8]) -> Option<Format> {
     let first = text.split(u8::is_ascii_whitespace).next()?;
     match first {
@@ -109,7 +109,7 @@ fn supported(text: &[u8]) -> Option<Format> {
     }
 }
 
-/// Other things that show a little later than in their first bytes.
+/// Other kinds, which are recognised a little after their first bytes.
 fn foreign(text: &[u8], wanted: Format) -> Option<&'static str> {
     let head: Vec<u8> = text[..text.len().min(1024)].to_ascii_lowercase();
     let has = |what: &[u8]| window(&head, what);
@@ -128,7 +128,7 @@ fn foreign(text: &[u8], wanted: Format) -> Option<&'static str> {
     if head.starts_with(b"{") && wanted != Format::Gltf {
         return Some("a JSON document");
     }
-    // A binary STL may begin with anything, and a glTF that is no text with its own name alone.
+    // A binary STL may begin with any bytes, and a glTF that is not text begins with its own name.
     let control = |b: &u8| b.is_ascii_control() && !b.is_ascii_whitespace();
     let text_only = matches!(wanted, Format::Obj | Format::Off);
     (text_only && text.iter().take(4).any(control)).then_some("binary data of an unknown kind")

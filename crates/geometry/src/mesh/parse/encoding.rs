@@ -1,13 +1,13 @@
-//! Bytes of a text in any Unicode encoding become the same text in UTF-8, without a byte-order
-//! mark.
+//! Converts text in any Unicode encoding to UTF-8 without a byte-order mark.
 //!
-//! UTF-16 and UTF-32 are told by their byte-order marks, UTF-16 also by its zeros: programs that
-//! save "Unicode" write it without a mark, too. Every other text is left as it is: keywords and
-//! numbers are the same bytes in UTF-8, Latin-1 and all that extend ASCII, and names are not read.
+//! UTF-16 and UTF-32 are recognised by their byte-order marks, UTF-16 also by its zeros, because
+//! programs that save "Unicode" write it without a mark, too. Every other text stays unchanged:
+//! keywords and numbers are the same bytes in UTF-8, Latin-1 and all encodings that extend ASCII,
+//! and names are ignored.
 
 use std::borrow::Cow;
 
-/// Pairs of bytes at the beginning by which UTF-16 without a mark is told.
+/// Number of pairs of bytes at the beginning by which UTF-16 without a mark is recognised.
 const N_PAIRS: usize = 8;
 
 #[derive(Clone, Copy)]
@@ -16,8 +16,8 @@ enum Order {
     Big,
 }
 
-/// The text in UTF-8 without a byte-order mark, or the bytes as they are if they are in no other
-/// Unicode encoding.
+/// The text in UTF-8 without a byte-order mark, or the same bytes if they are in no other Unicode
+/// encoding.
 ///
 /// ```
 /// use coseg_geometry::mesh::as_utf8;
@@ -133,7 +133,7 @@ mod tests {
         ] {
             assert_eq!(as_utf8(bytes), bytes);
         }
-        // Half a character at the end, and half of a pair.
+        // The text ends in half a character, and in half of a pair.
         assert_eq!(as_utf8(b"\xff\xfea\0b"), &b"a"[..]);
         assert_eq!(as_utf8(b"\xff\xfe\0\xd8a\0"), "\u{fffd}a".as_bytes());
     }

@@ -21,8 +21,8 @@ pub(super) fn glb(json: &str, binary: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Four corners of a square as floats, then the indices 0 1 2 2 1 3 as bytes, and as sparse data one
-/// index (short) with one position.
+/// Four corners of a square as floats, then the indices 0 1 2 2 1 3 as bytes, and as sparse data
+/// one index (short) with one position.
 pub(super) fn binary() -> Vec<u8> {
     let mut out: Vec<u8> = [
         0.0f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0,
@@ -36,7 +36,7 @@ pub(super) fn binary() -> Vec<u8> {
     out
 }
 
-/// A file with these nodes, primitives, accessors after the first two, and whatever else.
+/// A file with these nodes, primitives, accessors after the first two, and further entries.
 pub(super) fn json(nodes: &str, primitives: &str, accessors: &str, more: &str) -> String {
     format!(
         r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],"nodes":[{nodes}],
@@ -77,7 +77,7 @@ fn all_kinds_of_primitives_in_their_order() {
         r#"{"attributes":{},"mode":4}"#,
     ];
     let mesh = read(NODE, &primitives.join(","), "", "").unwrap();
-    // They share their positions.
+    // The primitives share their positions.
     assert_eq!(mesh.vertices.len(), 4);
     let expected = [
         [0, 1, 2],
@@ -106,7 +106,8 @@ fn nodes_move_their_meshes_depth_first() {
             "{v}: {found:?}"
         );
     };
-    // Node 3, turned, then scaled by 2, then moved by 10; it is mirrored, so that its triangles turn.
+    // Node 3 is turned, then scaled by 2, then moved by 10; it mirrors, so its triangles are
+    // flipped.
     close(1, [10.0, 2.0, 0.0]);
     close(2, [8.0, 0.0, 0.0]);
     assert_eq!(mesh.triangles[..2], [[0, 2, 1], [2, 3, 1]]);

@@ -1,11 +1,11 @@
-//! What no writer writes on purpose: every parser refuses it or reads a mesh that is in order.
+//! Damaged files: every parser refuses them or reads a consistent mesh.
 
 use super::gltf_tests::{SQUARE, binary, glb, json};
 use super::{parse, ply_stl_tests};
 use crate::mesh::Format;
 use proptest::prelude::{Strategy as _, any, prop, proptest};
 
-/// A small whole file of each kind.
+/// A small complete file of each kind.
 fn samples() -> Vec<(Format, Vec<u8>)> {
     let obj = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\nf -1 -2 \\\n-3\n";
     let off = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n3 0 1 2\n";
@@ -26,7 +26,7 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
     samples
 }
 
-/// Reads bytes and, if they are a mesh, checks it.
+/// Reads bytes and checks the mesh, if they are one.
 fn check(bytes: &[u8], format: Format) {
     let Ok(mesh) = parse(bytes, format) else {
         return;
@@ -39,7 +39,8 @@ fn check(bytes: &[u8], format: Format) {
         seen[p as usize] = true;
     }
     assert!(seen.iter().all(|&s| s));
-    // Nothing comes from nowhere: a vertex takes two bytes, unless a scene repeats it within its allowance.
+    // The size of the result is bounded: a vertex takes two bytes, unless a scene repeats it within
+    // its allowance.
     let most = if format == Format::Gltf { 1 << 17 } else { 0 } + bytes.len();
     assert!(mesh.vertices.len() <= most && mesh.triangles.len() <= most);
 }
@@ -51,7 +52,7 @@ fn files_that_are_cut_off_anywhere_are_refused_or_shorter() {
         for end in 0..whole.len() {
             check(&whole[..end], format);
         }
-        // A binary file lacks something as soon as it lacks a byte.
+        // A binary file is incomplete as soon as one byte is missing.
         if whole.contains(&0) {
             for end in 0..whole.len() {
                 assert!(
@@ -133,7 +134,7 @@ proptest! {
         places in prop::collection::vec((0..24usize).prop_map(|i| i), 12),
     ) {
         let whole = json(r#"{"mesh":0,"children":[]}"#, SQUARE, "", "");
-        // Put other numbers after some of the colons.
+        // Replaces the numbers after some of the colons.
         let parts: Vec<&str> = whole.split(':').collect();
         let mut text = String::from(parts[0]);
         for (i, part) in parts.iter().enumerate().skip(1) {

@@ -1,8 +1,8 @@
-//! Bytes of a mesh file become triangulated polygons, in file order.
+//! Parses the bytes of a mesh file to triangulated polygons, in file order.
 //!
-//! A parser refuses what cannot be meant (indices out of range, coordinates that are no numbers)
-//! and says where; what is merely dirty (degenerate faces, unused vertices) it passes on to
-//! `clean`. Geometry that is not read is counted.
+//! A parser refuses contents that cannot be intended (indices out of range, coordinates that are
+//! not numbers) and names the location. Defects (degenerate faces, unused vertices) are left for
+//! `clean`. Geometry that is skipped is counted.
 
 mod content;
 mod encoding;
@@ -16,12 +16,13 @@ mod text;
 use super::{Format, ParsedMesh, Triangulator};
 pub use encoding::as_utf8;
 
-/// Corners a polygon may have; a face with more is a damaged file.
+/// The largest number of corners of a polygon; a face with more shows that the file is damaged.
 pub const MAX_CORNERS: usize = 10_000;
-/// Triangles a mesh may have after triangulation.
+/// The largest number of triangles of a mesh after triangulation.
 pub const MAX_TRIANGLES: usize = 50_000_000;
 
-/// Why bytes are not a mesh. Faces and vertices count from 0 in file order, lines from 1.
+/// The reason why bytes are not a mesh. Faces and vertices count from 0 in file order, lines from
+/// 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[allow(missing_docs)] // the fields are the values of the message
 pub enum ParseError {
@@ -118,17 +119,18 @@ pub enum ParseError {
     },
     #[error("the JSON is not that of a glTF file: {reason}")]
     Json { reason: String },
-    #[error("{place} {why}")]
-    Gltf { place: String, why: String },
+    #[error("{location} {why}")]
+    Gltf { location: String, why: String },
     #[error("the file cannot be read: {reason}")]
     Reader { reason: String },
 }
 
 /// Reads the polygons of a mesh file and triangulates them; vertices and polygons keep their order.
 ///
-/// Coordinates are those of the file, in its units. Degenerate faces and unused vertices are kept,
-/// for [`clean`](super::clean) to deal with; what is read with reservations, or not at all, is
-/// counted in [`ParsedMesh::findings`]. The cost is linear in the size of the file.
+/// Coordinates are those of the file, in its units. Degenerate faces and unused vertices are kept
+/// for [`clean`](super::clean). Statements that are skipped, or that programs interpret
+/// differently, are counted in [`ParsedMesh::findings`]. The cost is linear in the size of the
+/// file.
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, ParseError, parse};
@@ -143,7 +145,7 @@ pub enum ParseError {
 /// ```
 ///
 /// # Errors
-/// Anything that is not a mesh with at least one face, indices in range and finite corners.
+/// If the bytes are not a mesh with at least one face, indices in range and finite corners.
 pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
     let parsed = match format {
         Format::Obj => obj::parse(&as_utf8(bytes)),
@@ -152,7 +154,8 @@ pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
         Format::Stl => stl::parse(bytes),
         Format::Gltf => gltf::parse(&as_utf8(bytes)),
     };
-    // Only a file that cannot be read is looked at again, so that no guess refuses one that can.
+    // The contents are examined only if the file cannot be read, so that no guess refuses a valid
+    // file.
     parsed.map_err(|error| match content::of(bytes, format) {
         None if bytes.is_empty() => ParseError::Empty,
         None => error,
@@ -160,7 +163,7 @@ pub fn parse(bytes: &[u8], format: Format) -> Result<ParsedMesh, ParseError> {
     })
 }
 
-/// Collects polygons, checks and triangulates them.
+/// Collects polygons, and checks and triangulates them.
 struct Polygons {
     mesh: ParsedMesh,
     triangulator: Triangulator,
@@ -177,7 +180,8 @@ impl Polygons {
         }
     }
 
-    /// Adds the next polygon of the file; its corners are indices in range, at least one.
+    /// Adds the next polygon of the file; it must have at least one corner, and its corners must be
+    /// in range.
     fn push(&mut self, corners: &[u32]) -> Result<(), ParseError> {
         let face = self.mesh.n_polygons;
         if let Some(position) = corners
@@ -223,7 +227,7 @@ impl Polygons {
     }
 }
 
-/// A token as it appears in a message: printable and short.
+/// A token in the form in which messages show it: printable and short.
 fn shown(token: &[u8]) -> String {
     String::from_utf8_lossy(&token[..token.len().min(40)])
         .chars()

@@ -1,4 +1,4 @@
-//! Wavefront OBJ: its `v` and `f` (formerly `fo`) statements, read by `tobj`.
+//! Reads Wavefront OBJ: its `v` and `f` (formerly `fo`) statements, by `tobj`.
 //!
 //! Only these two statements reach `tobj`, one clean line each, because given a whole file it
 //! - counts polylines (`l a b c`) as polygons and splits the polygons over groups and materials,
@@ -7,12 +7,12 @@
 //!
 //! Other geometry (lines, points, curves, surfaces, other files) and unknown statements are
 //! counted. A comment ends with its line, even if it ends in a backslash: a path in a comment must
-//! not swallow a face; since some programs have it otherwise, these are counted, too.
+//! not swallow a face. Some programs differ, so these comments are counted, too.
 //!
-//! A first polygon that names all vertices makes it keep the numbers of the file. Groups, objects and
-//! materials do not reorder anything. A vertex's weight or colour and a corner's texture and normal indices
-//! are not geometry and are left out. A face may name vertices that come after it, as many writers have
-//! it; a negative index counts back from the last vertex before the face.
+//! A first polygon that names all vertices makes `tobj` keep the numbers of the file. Groups,
+//! objects and materials do not reorder faces. A vertex's weight or colour and a corner's texture
+//! and normal indices are not geometry and are ignored. A face may name vertices that come after
+//! it, as many writers do; a negative index counts back from the last vertex before the face.
 
 use super::text::{Lines, before_comment, n_mixed_ends, number, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
@@ -26,8 +26,8 @@ const OPTIONS: tobj::LoadOptions = tobj::LoadOptions {
     ignore_lines: false,
 };
 
-/// Statements without a surface of their own: attributes of vertices, groups, states, and what
-/// belongs to a curve or surface that is counted by itself.
+/// Statements without a surface of their own: attributes of vertices, groups, states, and parts of
+/// a curve or surface that is counted itself.
 const WITHOUT_SURFACE: [&[u8]; 37] = [
     b"vt",
     b"vn",
@@ -164,7 +164,7 @@ impl Geometry {
         Ok(())
     }
 
-    /// Anything but ASCII would make `tobj` refuse the text without saying which line.
+    /// Bytes other than ASCII would make `tobj` refuse the text without naming the line.
     fn word(&mut self, word: &[u8], line: usize) -> Result<(), ParseError> {
         if word.is_empty() || !word.is_ascii() {
             let token = shown(word);
@@ -175,7 +175,7 @@ impl Geometry {
         Ok(())
     }
 
-    /// Where and why `tobj` refused the text; it says neither line nor face.
+    /// The location and the reason of an error of `tobj`, which names neither line nor face.
     fn fault(&self, error: &tobj::LoadError) -> ParseError {
         let n_vertices = self.n_vertices;
         let (mut n_seen, mut face) = (0_i64, 0);
@@ -245,7 +245,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let mut polygons = Polygons::new(positions.to_vec());
     polygons.mesh.findings.n_tolerated_statements = geometry.n_tolerated + n_mixed_ends(bytes);
     polygons.mesh.findings.n_unread_statements = geometry.n_unread;
-    // No arities means triangles only.
+    // Without arities all polygons are triangles.
     let arities = mesh.face_arities.iter().map(|&n| n as usize);
     let triangles = std::iter::repeat_n(3, mesh.indices.len() / 3);
     let arities: Vec<usize> = match mesh.face_arities.is_empty() {

@@ -1,9 +1,9 @@
-//! Object File Format: `OFF` and its variants with colours, normals, texture coordinates and other
-//! dimensions.
+//! Reads the Object File Format: `OFF` and its variants with colours, normals, texture coordinates
+//! and other dimensions.
 //!
-//! One vertex and one face a line, as every writer has it: only so can the optional values behind a
-//! vertex or a face be told from what follows. Counts are checked against the bytes before anything is
-//! allocated.
+//! Each vertex and each face has a line of its own, as every writer does: otherwise the optional
+//! values after a vertex or a face could not be distinguished from the next one. Counts are checked
+//! against the number of bytes before memory is allocated.
 
 use super::text::{Lines, before_comment, n_mixed_ends, number, position, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
@@ -12,19 +12,19 @@ use crate::mesh::ParsedMesh;
 /// Shortest line of a vertex, `0 0 0`, and of a face, `1 0`, with their line end.
 const MIN_VERTEX_BYTES: usize = 6;
 const MIN_FACE_BYTES: usize = 4;
-/// What may stand before the keyword, each once: texture coordinates, colours, normals, a fourth
+/// Prefixes of the keyword, each at most once: texture coordinates, colours, normals, a fourth
 /// coordinate, and a number of dimensions. Geomview wants them in this order, MeshLab writes them
 /// in another one.
 const PREFIXES: [&[u8]; 5] = [b"ST", b"C", b"N", b"4", b"n"];
 
-/// Lines with their numbers, without comments and empty ones.
+/// Lines with their numbers, except comments and empty lines.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
     Lines::new(bytes)
         .map(|(number, line)| (number, before_comment(line)))
         .filter(|(_, line)| words(line).next().is_some())
 }
 
-/// What the keyword says of the vertices.
+/// The format of the vertices according to the keyword.
 #[derive(Default)]
 struct Keyword {
     /// Whether a fourth, homogeneous coordinate follows the others.
@@ -33,8 +33,8 @@ struct Keyword {
     dimensions: bool,
 }
 
-/// What the first line says, and what follows the keyword on it: counts, or nothing. Files may
-/// begin with their counts.
+/// The keyword of the first line, and the words after it on that line: counts, or nothing. Files
+/// may begin with their counts.
 fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseError> {
     let first = words[0];
     let Some(at) = first.windows(3).position(|w| w == b"OFF") else {
@@ -55,7 +55,7 @@ fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseErro
         homogeneous: !left.contains(&&b"4"[..]),
         dimensions: !left.contains(&&b"n"[..]),
     };
-    // Some writers leave out the line end: `OFF490 518 0`.
+    // Some writers omit the line end: `OFF490 518 0`.
     let glued = Some(&first[at + 3..]).filter(|glued| !glued.is_empty());
     let rest: Vec<&[u8]> = glued
         .into_iter()
@@ -74,7 +74,7 @@ fn keyword<'a>(words: &[&'a [u8]]) -> Result<(Keyword, Vec<&'a [u8]>), ParseErro
 }
 
 impl Keyword {
-    /// Whether a vertex has a homogeneous coordinate beside the dimensions that the header gives,
+    /// Whether a vertex has a homogeneous coordinate in addition to the dimensions in the header,
     /// which must be 3.
     fn is_homogeneous(&self, (line, dimensions): (usize, &[u8])) -> Result<bool, ParseError> {
         match number::<u64>(line, dimensions)? {
@@ -87,7 +87,7 @@ impl Keyword {
     }
 }
 
-/// The count a header declares, refused when the file is too short to hold it.
+/// The count that a header declares; an error if the file is too short for it.
 fn count(
     what: &'static str,
     (line, token): (usize, &[u8]),
@@ -95,7 +95,7 @@ fn count(
     min_bytes: usize,
 ) -> Result<usize, ParseError> {
     let declared: u64 = number(line, token)?;
-    // The last line may lack its end.
+    // The last line may lack its line end.
     let limit = ((n_bytes + 1) / min_bytes).min(u32::MAX as usize) as u64;
     if declared > limit {
         return Err(ParseError::CountTooLarge {
@@ -123,7 +123,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let first: Vec<&[u8]> = words(first).collect();
     let (keyword, rest) = keyword(&first)?;
     let mut header: Vec<(usize, &[u8])> = rest.into_iter().map(|word| (line, word)).collect();
-    // The number of edges, which nobody needs, may be left out at the end of a line, but no count
+    // The number of edges, which is not used, may be missing at the end of a line, but no count
     // before it.
     let needed = 2 + usize::from(keyword.dimensions);
     while header.len() < needed {

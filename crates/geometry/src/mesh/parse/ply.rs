@@ -1,12 +1,13 @@
-//! Polygon File Format, also called Stanford PLY (Turk 1994): text, and binary in both byte orders.
+//! Reads the Polygon File Format, also called Stanford PLY (Turk 1994): text, and binary in both
+//! byte orders.
 //!
-//! Header and binary rows are read by `ply-rs-bw`, rows of text here: its grammar has no `1.`, `.5` or
-//! `nan`, and none of a row's place. Of the element `vertex` its `x y z`, of the element `face` its list
-//! `vertex_indices` (or `vertex_index`) is read, whatever the types; other properties and elements are
-//! skipped. A text has a row a line, and what a line holds beyond its properties is left out,
-//! because some writers put there what their header does not declare. Rows of triangle strips and
-//! of edges are counted as unread beside faces. Counts are checked against the bytes before
-//! anything is allocated.
+//! `ply-rs-bw` reads the header and binary rows. Rows of text are read here, because its grammar
+//! has no `1.`, `.5` or `nan`, and it does not report the location of a row. It reads `x y z` of
+//! the element `vertex` and the list `vertex_indices` (or `vertex_index`) of the element `face`, of
+//! any types; other properties and elements are skipped. A text has one row on each line; words
+//! beyond the declared properties are ignored, because some writers put values there that their
+//! header does not declare. Rows of triangle strips and of edges are counted as unread beside
+//! faces. Counts are checked against the number of bytes before memory is allocated.
 
 use super::text::{first_line, number, words};
 use super::{MAX_CORNERS, ParseError, Polygons, shown};
@@ -18,14 +19,14 @@ use ply_rs_bw::ply::{
 };
 use std::io::ErrorKind;
 
-/// What one row of any element says of a mesh.
+/// The contents of one row of any element, as far as a mesh needs them.
 #[derive(Default)]
 struct Row {
     position: [f64; 3],
     corners: Vec<i64>,
 }
 
-/// Which coordinate a property is.
+/// Index of the coordinate that a property holds.
 fn coordinate(name: &str) -> Option<usize> {
     ["x", "y", "z"].iter().position(|axis| *axis == name)
 }
@@ -74,8 +75,8 @@ impl PropertyAccess for Row {
     }
 }
 
-/// The next line of a header and the bytes it takes with its end: LF, CR LF, or CR alone where `cr`
-/// says so. A binary body may begin with a byte like LF.
+/// The next line of a header and its length including its end: LF, CR LF, or CR alone if `cr` is
+/// set. A binary body may begin with the same byte as LF.
 fn header_line(rest: &[u8], cr: bool) -> (&[u8], usize) {
     let end = if cr { b'\r' } else { b'\n' };
     let length = rest.iter().position(|&b| b == end);
@@ -83,15 +84,15 @@ fn header_line(rest: &[u8], cr: bool) -> (&[u8], usize) {
     (text.trim_ascii(), length.map_or(rest.len(), |l| l + 1))
 }
 
-/// What follows the header.
+/// The data after the header.
 struct Body<'a> {
     rest: &'a [u8],
     encoding: Encoding,
-    /// Number of the line that was read last.
+    /// Number of the last line read.
     line: usize,
 }
 
-/// The header, and what follows it.
+/// The header, and the data after it.
 fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
     if !bytes.starts_with(b"ply") {
         return Err(ParseError::BadHeader {
@@ -119,7 +120,7 @@ fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
             b"ply" | b"format" | b"element" | b"property" | b"obj_info" | b"end_header" => {
                 String::from_utf8_lossy(text).into_owned()
             }
-            // Comments, empty lines, and comments without the word, as some writers have them.
+            // Comments, empty lines, and comments without the keyword, which some writers produce.
             _ => "comment".into(),
         });
         if keyword == b"end_header" {
@@ -163,7 +164,7 @@ fn header(bytes: &[u8]) -> Result<(Header, Body<'_>), ParseError> {
 }
 
 impl Body<'_> {
-    /// The next row; `None` when it is not there as a whole.
+    /// The next row; `None` when it is incomplete.
     fn row(&mut self, element: &ElementDef, index: usize) -> Result<Option<Row>, ParseError> {
         let parser = Parser::<Row>::new();
         let row = match self.encoding {
@@ -182,7 +183,7 @@ impl Body<'_> {
         }
     }
 
-    /// The next line of a text that is not empty.
+    /// The next non-empty line of a text.
     fn text_row(&mut self, element: &ElementDef, index: usize) -> Result<Option<Row>, ParseError> {
         let mut row = Row::default();
         if element.properties.is_empty() {
@@ -232,7 +233,7 @@ impl Body<'_> {
     }
 }
 
-/// What messages call an element's rows.
+/// The name of an element's rows in messages.
 fn rows_are(element: &ElementDef) -> &'static str {
     match element.name.as_str() {
         "vertex" => "vertices",
@@ -241,7 +242,7 @@ fn rows_are(element: &ElementDef) -> &'static str {
     }
 }
 
-/// Refuses more rows than the file is long enough to hold.
+/// Returns an error for more rows than fit into the length of the file.
 fn check_count(element: &ElementDef, encoding: Encoding, n_bytes: usize) -> Result<(), ParseError> {
     let size = |scalar: &ScalarType| match scalar {
         ScalarType::Char | ScalarType::UChar => 1,
@@ -250,7 +251,7 @@ fn check_count(element: &ElementDef, encoding: Encoding, n_bytes: usize) -> Resu
         ScalarType::Double => 8,
     };
     let min: usize = match encoding {
-        // A digit and what separates it from the next.
+        // A digit and its separator.
         Encoding::Ascii => 2 * element.properties.len(),
         _ => element
             .properties
@@ -260,7 +261,7 @@ fn check_count(element: &ElementDef, encoding: Encoding, n_bytes: usize) -> Resu
             })
             .sum(),
     };
-    // The last word of a text may lack what separates it.
+    // The last word of a text may lack its separator.
     let limit = match min {
         0 => 0,
         min => ((n_bytes + 1) / min).min(u32::MAX as usize),
@@ -276,7 +277,7 @@ fn check_count(element: &ElementDef, encoding: Encoding, n_bytes: usize) -> Resu
     Ok(())
 }
 
-/// The elements that make a mesh, if they are there and in the order in which they can be read.
+/// Checks that the elements of a mesh exist and come in an order in which they can be read.
 fn check(header: &Header) -> Result<(), ParseError> {
     let place = |name: &str| header.elements.get_index_of(name);
     let (Some(vertex), Some(face)) = (place("vertex"), place("face")) else {
@@ -315,7 +316,7 @@ fn check(header: &Header) -> Result<(), ParseError> {
     Ok(())
 }
 
-/// Refuses a face with fewer corners than one or more than are read.
+/// Returns an error for a face with no corners or with more than the limit.
 fn check_corners(face: usize, n: usize) -> Result<(), ParseError> {
     match n {
         0 => Err(ParseError::EmptyPolygon { face }),
@@ -327,7 +328,7 @@ fn check_corners(face: usize, n: usize) -> Result<(), ParseError> {
     }
 }
 
-/// A face's corners, all of them vertices.
+/// The corners of a face, all of which must be vertices.
 fn corners(row: &Row, face: usize, n_vertices: usize) -> Result<Vec<u32>, ParseError> {
     check_corners(face, row.corners.len())?;
     let inside = |&vertex: &i64| match u32::try_from(vertex) {

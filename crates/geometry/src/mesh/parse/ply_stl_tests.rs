@@ -322,7 +322,7 @@ fn text_stl_may_have_several_statements_on_a_line() {
     let mesh = stl(coloured.as_bytes()).unwrap();
     assert_eq!(mesh.vertices, plain.vertices);
     assert_eq!(mesh.findings.n_unread_statements, 1);
-    // Words that are no statement begin a line: which of them are geometry nobody knows.
+    // Unknown words begin a line; whether they are geometry is unknown.
     assert_eq!(
         stl(text.replacen("endfacet", "end facet", 1).as_bytes())
             .unwrap_err()

@@ -1,10 +1,11 @@
-//! STL, text and binary: triangles (in text, any polygons) that share no vertices.
+//! Reads STL, text and binary: triangles (in text, any polygons) that share no vertices.
 //!
 //! Text is read word by word, since some writers put a facet or a whole file on one line. Words
-//! behind a statement on its line that are no keyword, such as a colour, are counted as unread.
+//! that follow a statement on its line and are not keywords, such as a colour, are counted as
+//! unread.
 //!
-//! A file is binary if its length is the one that its count of triangles gives, or if it does not begin
-//! with `solid`: some binary files do begin so. Corners at equal positions become one vertex when the
+//! A file is binary if its length matches its count of triangles, or if it does not begin with
+//! `solid`: some binary files do begin so. Corners at equal positions become one vertex when the
 //! mesh is cleaned.
 
 use super::text::{Lines, n_mixed_ends, number, position, words};
@@ -13,7 +14,8 @@ use crate::mesh::ParsedMesh;
 
 /// Bytes before the triangles of a binary file, of which the last four are their number.
 const HEADER: usize = 84;
-/// Bytes of a binary triangle: normal, three corners, and two that each program uses as it likes.
+/// Bytes of a binary triangle: normal, three corners, and two bytes that programs use in different
+/// ways.
 const TRIANGLE: usize = 50;
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
@@ -40,7 +42,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     }
 }
 
-/// Triangles of a file whose length is right.
+/// The triangles of a file whose length matches its count.
 fn binary(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     let (triangles, _) = bytes[HEADER..].as_chunks::<TRIANGLE>();
     let mut vertices = Vec::with_capacity(3 * triangles.len());
@@ -57,7 +59,7 @@ fn binary(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     polygons.finish()
 }
 
-/// What a statement of a text begins with.
+/// The first words of the statements of a text.
 const KEYWORDS: [&str; 7] = [
     "solid", "facet", "outer", "vertex", "endloop", "endfacet", "endsolid",
 ];
@@ -70,10 +72,10 @@ fn is_keyword(word: &[u8]) -> bool {
     KEYWORDS.iter().any(|keyword| is(word, keyword))
 }
 
-/// A text while it is read.
+/// The state of reading a text.
 struct Text {
     polygons: Polygons,
-    /// First vertex of the loop that is open.
+    /// First vertex of the open loop.
     open: Option<usize>,
     solid: bool,
 }
@@ -117,7 +119,7 @@ impl Text {
         Ok(())
     }
 
-    /// Reads the statement that begins at a word, and says how many words it has.
+    /// Reads the statement that begins at a word, and returns its number of words.
     fn statement(&mut self, line: usize, words: &[&[u8]], at: usize) -> Result<usize, ParseError> {
         let polygons = &mut self.polygons;
         let n_vertices = polygons.mesh.vertices.len();
@@ -149,7 +151,7 @@ impl Text {
                 self.open = None;
                 1
             }
-            // A normal follows, in whatever words: it is not read.
+            // The words of the normal that follows are ignored.
             (b"facet", None) => {
                 let normal = rest.iter().position(|word| is_keyword(word));
                 1 + normal.unwrap_or(rest.len())
@@ -170,8 +172,8 @@ impl Text {
     }
 }
 
-/// Words of the name behind `solid` or `endsolid`. It may have any words and ends with its line, or
-/// where a facet begins with its normal.
+/// Number of words of the name after `solid` or `endsolid`. It may have any words and ends with its
+/// line, or where a facet begins with its normal.
 fn name(line: usize, rest: &[&[u8]]) -> usize {
     let facet = |words: &[&[u8]]| {
         is(words[0], "facet") && is(words[1], "normal") && number::<f64>(line, words[2]).is_ok()

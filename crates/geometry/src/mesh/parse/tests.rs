@@ -256,7 +256,8 @@ fn off_errors_name_the_place_and_the_value() {
     }
 }
 
-/// Three faces of a cube, of which the last is given by each line that programs differ about.
+/// Three faces of a cube, of which the last is given by each line that programs interpret
+/// differently.
 #[test]
 fn obj_statements_that_programs_differ_about_are_read_and_counted() {
     let plain = obj(&format!("{V4}f 1 2 3\nf 1 2 3 4\n")).unwrap();
@@ -286,7 +287,7 @@ fn obj_geometry_that_is_not_read_is_counted() {
     assert_eq!(findings.n_tolerated_statements, 0);
 }
 
-/// Every text format, however its lines end and whatever Unicode encoding it is in.
+/// Every text format, with all line ends and in all Unicode encodings.
 #[test]
 fn texts_are_read_in_every_encoding_and_with_every_line_end() {
     let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
@@ -407,7 +408,7 @@ fn faces_that_are_not_planar_or_cross_themselves_are_counted() {
     let mesh = obj(text).unwrap();
     assert_eq!(mesh.findings.n_nonplanar_polygons, 1);
     assert_eq!(mesh.findings.n_nonsimple_polygons, 1);
-    // Each is its fan, as before it was counted.
+    // Each polygon is its fan, as before such statements were counted.
     assert_eq!(
         mesh.triangles,
         [

@@ -1,4 +1,4 @@
-//! Bytes of a text format become lines and words, with the number of the line.
+//! Splits the bytes of a text format into lines and words, with line numbers.
 
 use super::{ParseError, shown};
 
@@ -29,8 +29,8 @@ impl<'a> Iterator for Lines<'a> {
     }
 }
 
-/// The first line without its end, and the bytes that it takes with it. A line ends in LF, in CR
-/// LF, in CR CR LF (a text that was converted twice), or in CR alone.
+/// The first line without its end, and its length including its end. A line ends in LF, in CR LF,
+/// in CR CR LF (a text that was converted twice), or in CR alone.
 pub(super) fn first_line(text: &[u8]) -> (&[u8], usize) {
     let Some(end) = text.iter().position(|b| matches!(b, b'\n' | b'\r')) else {
         return (text, text.len());
@@ -43,8 +43,8 @@ pub(super) fn first_line(text: &[u8]) -> (&[u8], usize) {
     (&text[..end], end + n)
 }
 
-/// Lines that end in CR alone, in a text that also has LF: the first release took such a CR for a
-/// space.
+/// Number of lines that end in CR alone, in a text that also has LF: version 0.1.0 treated such a
+/// CR as a space.
 pub(super) fn n_mixed_ends(text: &[u8]) -> usize {
     if !text.contains(&b'\r') || !text.contains(&b'\n') {
         return 0;
@@ -59,19 +59,19 @@ pub(super) fn n_mixed_ends(text: &[u8]) -> usize {
     n
 }
 
-/// What comes before the first `#`.
+/// The part of a line before the first `#`.
 pub(super) fn before_comment(line: &[u8]) -> &[u8] {
     let end = line.iter().position(|&b| b == b'#');
     &line[..end.unwrap_or(line.len())]
 }
 
-/// Words between white space.
+/// Words separated by white space.
 pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     line.split(u8::is_ascii_whitespace)
         .filter(|word| !word.is_empty())
 }
 
-/// A word as a number.
+/// Parses a word as a number.
 pub(super) fn number<T: std::str::FromStr>(line: usize, token: &[u8]) -> Result<T, ParseError> {
     std::str::from_utf8(token)
         .ok()
@@ -82,7 +82,7 @@ pub(super) fn number<T: std::str::FromStr>(line: usize, token: &[u8]) -> Result<
         })
 }
 
-/// The first three words as a position; what follows them is no geometry.
+/// The first three words as a position; later words are not geometry.
 pub(super) fn position<'a>(
     line: usize,
     words: &mut impl Iterator<Item = &'a [u8]>,

@@ -1,12 +1,12 @@
-//! A polygon becomes triangles that cover it: its fan from the first corner where that does, else a
+//! Triangulates a polygon: by its fan from the first corner if the fan covers it, else by a
 //! constrained Delaunay triangulation of its projection onto its own plane.
 //!
-//! The fan comes first because it is what a convex polygon needs, and costs one pass. The Delaunay
+//! The fan comes first because it is right for a convex polygon, and costs one pass. The Delaunay
 //! triangulation keeps every corner, also those on a straight line, which the neighbours of the
 //! polygon may share, and makes no slivers there; its predicates are exact. A polygon with a hole,
-//! which a bridge joins to the outer ring, is one polygon that passes the bridge twice: the inside
+//! which a bridge joins to the outer ring, is one polygon that passes the bridge twice: its inside
 //! is where the winding number is 1. A polygon that crosses itself or has no area keeps its fan,
-//! and the caller is told.
+//! and the result says so.
 
 use super::{cross, dot, norm, sub};
 use spade::handles::FixedVertexHandle;
@@ -14,12 +14,14 @@ use spade::{ConstrainedDelaunayTriangulation, HasPosition, Point2, Triangulation
 use std::collections::HashMap;
 use std::f64::consts::TAU;
 
-/// A polygon whose corners leave its plane by more than this share of its size is not planar: below
-/// it, how it is triangulated changes its area by less than a thousandth.
+/// A polygon whose corners leave its plane by more than this share of its size is not planar. Below
+/// it, the choice of triangulation changes the area by less than a thousandth.
 const PLANAR: f64 = 0.01;
-/// A polygon with less area than this share of its size squared has no plane, as cleaning has it.
+/// A polygon with less area than this share of its size squared has no plane; cleaning uses the
+/// same limit.
 const MIN_AREA: f64 = 1e-12;
-/// A fan may fold over itself by this share of the area: corners on a line, in files of six digits.
+/// A fan may fold over itself by this share of the area: corners on a line, in files of six digits,
+/// do so.
 const FOLD: f64 = 1e-6;
 
 /// A corner farther than this from an edge, in units of the polygon's size, does not lie on it.
@@ -27,30 +29,30 @@ const ASIDE: f64 = 1e-6;
 
 type Plane = ConstrainedDelaunayTriangulation<Point>;
 
-/// What a polygon turned out to be.
+/// The properties of a polygon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PolygonKind {
     /// Whether its corners lie in a plane.
     pub planar: bool,
     /// Whether it has an area and does not cross itself. Otherwise its triangles are its fan,
-    /// whatever that is.
+    /// however bad.
     pub simple: bool,
     /// Whether its triangles are its fan from the first corner.
     pub fan: bool,
 }
 
-/// Triangulates polygons; holds memory that the next one uses again.
+/// Triangulates polygons; its memory is reused for the next polygon.
 #[derive(Debug, Default)]
 pub struct Triangulator {
-    /// Corners from the first one, then in the plane of the polygon; in units of its size.
+    /// Corners relative to the first one, then in the plane of the polygon; in units of its size.
     local: Vec<[f64; 3]>,
     flat: Vec<[f64; 2]>,
 }
 
 impl Triangulator {
-    /// Gives `out` the triangles of a polygon: `corners.len() - 2` of them, or one degenerate
+    /// Writes the triangles of a polygon to `out`: `corners.len() - 2` of them, or one degenerate
     /// triangle if there are fewer than three corners; in the polygon's orientation. The same
-    /// positions always give the same.
+    /// positions always give the same triangles.
     ///
     /// O(n log n) for ordinary polygons.
     ///
@@ -104,8 +106,8 @@ impl Triangulator {
         kind
     }
 
-    /// Projects a polygon onto the plane of its Newell normal; whether it was in it, `None` if
-    /// there is none.
+    /// Projects a polygon onto the plane of its Newell normal. Returns whether the polygon lies in
+    /// the plane, or `None` if it has no normal.
     fn flatten(&mut self, vertices: &[[f64; 3]], corners: &[u32]) -> Option<bool> {
         let position = |v: u32| vertices[v as usize];
         let first = position(corners[0]);
@@ -134,8 +136,8 @@ impl Triangulator {
             return None;
         }
         let normal = normal.map(|x| x / doubled);
-        // The axis that is farthest from the normal, so that planes along axes are projected
-        // exactly.
+        // The axis that is farthest from the normal is chosen, so that planes along axes are
+        // projected exactly.
         let least = (0..3).fold(0, |l, i| {
             if normal[i].abs() < normal[l].abs() {
                 i
@@ -150,7 +152,7 @@ impl Triangulator {
         let v = v.map(|x| x / length);
         let u = cross(v, normal);
         self.flat.clear();
-        // Adding zero makes -0 and 0 one.
+        // Adding zero makes -0 and 0 equal.
         self.flat.extend(
             self.local
                 .iter()
@@ -180,7 +182,7 @@ fn cross_2(a: [f64; 2], b: [f64; 2]) -> f64 {
 }
 
 /// Whether the fan from the first corner, at the origin, covers a polygon once: all its triangles
-/// turn the same way, and not more than once around.
+/// have the same orientation, and go around at most once.
 fn fan_covers(flat: &[[f64; 2]]) -> bool {
     let away = |p: &&[f64; 2]| **p != [0.0, 0.0];
     let spokes: Vec<&[f64; 2]> = match flat[1..].iter().position(|p| away(&p)) {
@@ -190,7 +192,7 @@ fn fan_covers(flat: &[[f64; 2]]) -> bool {
             flat[begin + 1..=end].iter().collect()
         }
     };
-    // The polygon comes back to its first corner: a hole or another lobe begins there.
+    // The polygon returns to its first corner: a hole or another lobe begins there.
     if !spokes.iter().all(away) {
         return false;
     }
@@ -215,12 +217,12 @@ fn other_diagonal(flat: &[[f64; 2]]) -> Option<Vec<[usize; 3]>> {
     triangles.iter().all(positive).then(|| triangles.to_vec())
 }
 
-/// The triangles of a polygon that does not cross itself, as positions in it.
+/// The triangles of a polygon that does not cross itself, as indices of its corners.
 fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
     let (plane, ring) = points(flat, local)?;
     let (plane, passes) = edges(plane, &ring, local)?;
     let passes_of = |from: usize, to: usize| passes.get(&(from, to)).copied().unwrap_or(0);
-    // The winding number of each face, from the outside inwards.
+    // The winding number of each face, computed from the outside inwards.
     let mut winding: Vec<Option<i32>> = vec![None; plane.num_all_faces()];
     winding[plane.outer_face().index()] = Some(0);
     let mut todo: Vec<_> = plane.convex_hull().collect();
@@ -248,10 +250,10 @@ fn delaunay(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<Vec<[usize; 3]>> {
     (!triangles.is_empty()).then_some(triangles)
 }
 
-/// Corners at one position in the plane.
+/// Corners at the same position in the plane.
 struct Point {
     position: Point2<f64>,
-    /// The first of them.
+    /// The first of these corners.
     corner: usize,
 }
 
@@ -263,10 +265,11 @@ impl HasPosition for Point {
     }
 }
 
-/// The points of a polygon in the plane, and the point of each corner. `None` if corners at different
-/// positions fall on one point, which is the case for a polygon that stands on its own plane.
+/// The points of a polygon in the plane, and the point of each corner. `None` if corners at
+/// different positions fall on one point, as in a polygon that is perpendicular to its own plane.
 fn points(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<(Plane, Vec<FixedVertexHandle>)> {
-    // Below this a coordinate has no digits left in predicates; the unit is the size of the polygon.
+    // Coordinates below this have no digits left in predicates; the unit is the size of the
+    // polygon.
     let kept = |x: f64| match x.abs() < spade::MIN_ALLOWED_VALUE {
         true => 0.0,
         false => x,
@@ -292,7 +295,8 @@ fn points(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<(Plane, Vec<FixedVert
         let position = Point2::new(x, y);
         all.push(Point { position, corner });
     }
-    // All at once: one after the other they may take the square of their number.
+    // Loaded in bulk, because inserting them one after the other may take time quadratic in their
+    // number.
     let plane = Plane::bulk_load(all).ok()?;
     let mut at = vec![None; flat.len()];
     for vertex in plane.vertices() {
@@ -302,13 +306,12 @@ fn points(flat: &[[f64; 2]], local: &[[f64; 3]]) -> Option<(Plane, Vec<FixedVert
     Some((plane, ring?))
 }
 
-/// How often the polygon passes along each pair of points; edges that other corners lie on are
-/// passed in pieces.
+/// How often the polygon passes along each pair of points. Edges with other corners on them are
+/// divided into pieces.
 type Passes = HashMap<(usize, usize), i32>;
 
-/// The plane with the polygon's edges in it, and how often each is passed; `None` if two of them
-/// cross, or if a corner that lies on an edge in the plane does not do so in space, where
-/// `local` has it.
+/// Inserts the polygon's edges into the plane and counts how often each is passed. `None` if two of
+/// them cross, or if a corner lies on an edge in the plane but not in space, according to `local`.
 fn edges(
     mut plane: Plane,
     ring: &[FixedVertexHandle],

@@ -3,7 +3,7 @@ use crate::mesh::{add, cross, dot, norm, scale, sub, unit};
 use proptest::prelude::{Strategy, any, prop, prop_assert, prop_assert_eq, proptest};
 use std::collections::HashMap;
 
-/// Sums of a few hundred areas in double precision.
+/// Rounding of sums of a few hundred areas in double precision.
 const EXACT: f64 = 1e-9;
 
 /// A C with its arms to the right; area 7.
@@ -18,7 +18,7 @@ const C: [[f64; 2]; 8] = [
     [0.0, 3.0],
 ];
 
-/// Triangles of a polygon in the plane z = 0, from any of its corners, with what it is.
+/// Triangles of a polygon in the plane z = 0, from any of its corners, with its properties.
 fn triangulated(polygon: &[[f64; 2]], start: usize) -> (Vec<[u32; 3]>, PolygonKind) {
     of_vertices(&lifted(polygon), start)
 }
@@ -52,9 +52,8 @@ fn shoelace(polygon: &[[f64; 2]]) -> f64 {
     (0..n).map(part).sum()
 }
 
-/// What is left of the triangles' edges when those that two triangles pass in opposite directions
-/// are taken away, by positions: the polygon's edges, and nothing else, if the triangles hang
-/// together as they should.
+/// The triangles' edges, by positions, without those that two triangles pass in opposite
+/// directions. In a correct triangulation exactly the polygon's edges remain.
 fn border(edges: impl Iterator<Item = [[f64; 3]; 2]>) -> Vec<[[u64; 3]; 2]> {
     let mut passes: HashMap<[[u64; 3]; 2], i32> = HashMap::new();
     for [a, b] in edges {
@@ -100,7 +99,7 @@ fn check(vertices: &[[f64; 3]], start: usize, wanted_area: f64) -> Result<(), St
     }
 }
 
-/// Checks a polygon from each of its corners, and the same with a hundred other planes and places.
+/// Checks a polygon from each of its corners, and in a hundred other planes and positions.
 fn check_all(name: &str, polygon: &[[f64; 2]]) {
     let wanted = shoelace(polygon);
     assert!(wanted > 0.0, "{name}");
@@ -204,7 +203,7 @@ fn a_polygon_is_covered_whatever_its_first_corner_and_its_plane() {
 
 #[test]
 fn corners_on_a_line_stay_corners() {
-    // An L whose sides are divided, as where smaller faces meet it.
+    // An L whose sides are divided, like those next to smaller faces.
     let mut l = Vec::new();
     for (from, to) in [
         ([0.0, 0.0], [4.0, 0.0]),
@@ -240,11 +239,11 @@ fn a_convex_polygon_has_its_fan() {
         let (triangles, kind) = triangulated(&polygon, 0);
         assert_eq!(triangles, fan);
         assert!(kind.fan && kind.simple && kind.planar);
-        // Seen from behind, the same corners are a polygon the other way round.
+        // From behind, the same corners are a polygon in the opposite order.
         let behind: Vec<[f64; 3]> = polygon.iter().map(|p| [p[1], p[0], 7.0]).collect();
         assert_eq!(of_vertices(&behind, 0).0, fan);
     }
-    // Corners on a line, and one twice, as cleaning expects them.
+    // Corners on a line, one of them twice, as cleaning expects.
     let bent = [
         [0.0, 0.0],
         [1.0, 0.0],
@@ -256,7 +255,7 @@ fn a_convex_polygon_has_its_fan() {
     let (triangles, kind) = triangulated(&bent, 0);
     assert_eq!(triangles, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]);
     assert!(kind.fan && kind.simple);
-    // A star-shaped polygon that its first corner sees as a whole.
+    // A star-shaped polygon whose first corner sees all of it.
     let arrow = [[1.0, 0.0], [4.0, -1.0], [4.0, 1.0], [0.0, 9.0]];
     assert!(triangulated(&arrow, 0).1.fan);
 }
@@ -295,7 +294,7 @@ fn a_keyhole_polygon_is_one_piece() {
             (found - shoelace(&polygon)).abs() < EXACT,
             "{start}: {found}"
         );
-        // One piece: every triangle is reached over edges.
+        // The triangles form one piece: every triangle is reached over edges.
         let mut reached = vec![false; triangles.len()];
         let place = |v: u32| polygon[v as usize].map(f64::to_bits);
         let shared = |a: [u32; 3], b: [u32; 3]| {
@@ -348,7 +347,7 @@ fn what_is_no_simple_polygon_keeps_its_fan_and_is_reported() {
         assert!(!kind.simple && kind.fan, "{name}: {kind:?}");
         assert_eq!(triangles, fan, "{name}");
     }
-    // Numbers whose squares are none.
+    // The squares of these numbers overflow.
     let huge = [[-1e308, 0.0], [1e308, 0.0], [1e308, 1e308], [0.0, 1e307]];
     assert!(!triangulated(&huge, 0).1.simple);
     let tiny: Vec<[f64; 2]> = C.iter().map(|p| p.map(|x| x * 1e-310)).collect();
@@ -366,13 +365,14 @@ fn a_polygon_that_leaves_its_plane_is_reported() {
     let (triangles, kind) = bent(0.5);
     assert!(!kind.planar && kind.simple);
     assert_eq!(triangles.len(), 6);
-    // One that stands on its own plane has corners above each other.
+    // A polygon perpendicular to its own plane has corners above each other.
     let mut step = lifted(&C);
     step[3] = [3.0, 1.0, 5.0];
     assert!(!of_vertices(&step, 0).1.simple);
 }
 
-/// Polygons with as many corners as are read are triangulated in a moment, whatever they look like.
+/// Polygons with the largest accepted number of corners are triangulated quickly, whatever their
+/// form.
 #[test]
 fn large_polygons_take_no_long() {
     let n = crate::mesh::MAX_CORNERS;
@@ -411,8 +411,8 @@ fn cross_each_other(polygon: &[[f64; 2]]) -> bool {
     (0..n).any(|i| (i + 2..n).any(|j| (j + 1) % n != i && meet(i, j)))
 }
 
-/// Simple polygons of any form: a triangle whose edges are broken at random points as long as none
-/// cross.
+/// Simple polygons of any form: a triangle whose edges are broken at random points as long as no
+/// edges cross.
 fn simple_polygon() -> impl Strategy<Value = Vec<[f64; 2]>> {
     let points = prop::collection::vec((0..1000_i32, 0..1000_i32, any::<u16>()), 3..24);
     points.prop_map(|points| {
@@ -463,7 +463,7 @@ proptest! {
         if kind.fan {
             prop_assert_eq!(triangles.len(), vertices.len().saturating_sub(2).max(1));
         }
-        // They turn with the polygon: the sum of their normals is its own.
+        // Triangles have the orientation of the polygon: the sum of their normals is its own.
         let sum = |triangles: &[[u32; 3]]| {
             triangles.iter().fold([0.0; 3], |sum, t| {
                 let [a, b, c] = t.map(|v| vertices[v as usize]);

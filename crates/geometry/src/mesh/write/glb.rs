@@ -1,7 +1,8 @@
-//! Labelled polygons become a binary glTF 2.0 file: a primitive and a named material for each label.
+//! Writes labelled polygons as a binary glTF 2.0 file: a primitive and a named material for each
+//! label.
 //!
-//! All primitives share one list of positions. Triangles are grouped by label, so each primitive says in
-//! its `extras` which polygons of the input it has, as first and count of each run of consecutive ones.
+//! All primitives share one list of positions. Triangles are grouped by label; each primitive lists
+//! its polygons of the input in its `extras`, as first and count of each run of consecutive ones.
 //! The triangles of a polygon are those of [`Triangulator`], on which its label was computed.
 
 use super::{append, by_label, runs};
@@ -12,15 +13,15 @@ use std::fmt::Write as _;
 const MIN_SIZE: f64 = 1e-30;
 const MAX_SIZE: f64 = 1e30;
 
-/// Positions in single precision, and what takes them back: a translation and a factor.
+/// Positions in single precision, and their inverse transform: a translation and a factor.
 struct Placed {
     positions: Vec<[f32; 3]>,
     translation: [f64; 3],
     factor: f64,
 }
 
-/// A mesh whose coordinates are not exact in single precision is moved to the origin, where most digits
-/// survive. Positions that are no numbers, which no polygon names, become 0.
+/// Moves a mesh whose coordinates are not exact in single precision to the origin, where most
+/// digits survive. Positions that are not finite, which no polygon uses, become 0.
 fn place(vertices: &[[f64; 3]]) -> Placed {
     let finite = || vertices.iter().filter(|v| v.iter().all(|x| x.is_finite()));
     let exact = finite().flatten().all(|&x| f64::from(x as f32) == x);
@@ -66,7 +67,7 @@ fn quoted(text: &str) -> String {
     out
 }
 
-/// An sRGB component as linear light, which glTF wants.
+/// An sRGB component as linear light, which glTF requires.
 fn linear(c: u8) -> f64 {
     let x = f64::from(c) / 255.0;
     if x <= 0.04045 {
@@ -76,7 +77,7 @@ fn linear(c: u8) -> f64 {
     }
 }
 
-/// The rotation that takes a coordinate axis to +Y, which is up in glTF, as x, y, z, w.
+/// The rotation from a coordinate axis to +Y, which is up in glTF, as x, y, z, w.
 fn upright(up: [f64; 3]) -> [f64; 4] {
     use std::f64::consts::FRAC_1_SQRT_2 as H;
     match up.map(|x| x as i8) {
@@ -89,8 +90,8 @@ fn upright(up: [f64; 3]) -> [f64; 4] {
     }
 }
 
-/// A binary glTF file of one mesh, called `name`. `material` gives the name and sRGB colour of a
-/// label. Where the coordinate axis `up` is not +Y a node around the mesh turns it there.
+/// A binary glTF file of one mesh, called `name`. `material` returns the name and sRGB colour of a
+/// label. If the coordinate axis `up` is not +Y, a node around the mesh turns it there.
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, icosphere, parse, write};
@@ -217,7 +218,7 @@ pub fn glb<P: AsRef<[u32]>>(
     glb_of(json, binary)
 }
 
-/// The file of a JSON and a binary chunk, each padded to four bytes.
+/// A file of a JSON and a binary chunk, each padded to four bytes.
 ///
 /// ```
 /// let json = "{\"asset\":{\"version\":\"2.0\"}}".to_string();
@@ -284,7 +285,7 @@ mod tests {
             for sign in [1.0, -1.0] {
                 let mut up = [0.0; 3];
                 up[k] = sign;
-                // The axis itself, and a triangle that tells turning from mirroring.
+                // The axis itself, and a triangle that distinguishes turning from mirroring.
                 let vertices = [up, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
                 let bytes = glb("a", &vertices, &[[1, 2, 3]], &[0], Some(up), material);
                 let found = parse(&bytes, Format::Gltf).unwrap().vertices;

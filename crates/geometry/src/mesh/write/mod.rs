@@ -1,7 +1,7 @@
-//! A mesh, with labels and colours where the format has room for them, becomes the bytes of a file.
+//! Writes a mesh as the bytes of a file, with labels and colours in formats that hold them.
 //!
-//! Coordinates are written with as many digits as it takes to read the same number back; labels keep the
-//! order of the polygons.
+//! Coordinates are written with enough digits to read the same number back; labels keep the order
+//! of the polygons.
 
 mod glb;
 mod usda;
@@ -13,7 +13,7 @@ use super::TriMesh;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// Object File Format text. Reading it gives back the same numbers.
+/// Writes Object File Format text. Reading it returns the same numbers.
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, icosphere, parse, write};
@@ -39,8 +39,8 @@ pub fn off(mesh: &TriMesh) -> String {
     out
 }
 
-/// Wavefront OBJ text: a group and a material, named by `name`, for every run of polygons of one
-/// label. `material_file` is the name of a file with the text of [`mtl`].
+/// Writes Wavefront OBJ text: a group and a material, named by `name`, for every run of polygons of
+/// one label. `material_file` is the name of a file with the text of [`mtl`].
 ///
 /// ```
 /// use coseg_geometry::mesh::write;
@@ -83,7 +83,7 @@ pub fn obj<P: AsRef<[u32]>>(
     out
 }
 
-/// Materials for [`obj`], as MTL text: a name and a diffuse sRGB colour each.
+/// Writes materials for [`obj`], as MTL text: a name and a diffuse sRGB colour each.
 ///
 /// ```
 /// let text = coseg_geometry::mesh::write::mtl(&[("leg".to_string(), [255, 0, 0])]);
@@ -101,8 +101,8 @@ pub fn mtl(materials: &[(String, [u8; 3])]) -> String {
     out
 }
 
-/// Binary little-endian PLY: `double` coordinates; per face its corners, `red green blue` and
-/// `int label`.
+/// Writes binary little-endian PLY: `double` coordinates; for each face its corners, `red green
+/// blue` and `int label`.
 ///
 /// ```
 /// use coseg_geometry::mesh::{Format, parse, write};
@@ -123,7 +123,7 @@ pub fn ply<P: AsRef<[u32]>>(
 ) -> Vec<u8> {
     assert_eq!(polygons.len(), colours.len(), "one colour per polygon");
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
-    // A one-byte count is what most readers expect; it is widened only when a polygon needs it.
+    // Most readers expect a one-byte count; it is widened only when a polygon needs it.
     let wide = polygons
         .iter()
         .any(|p| p.as_ref().len() > usize::from(u8::MAX));
@@ -161,7 +161,7 @@ pub fn ply<P: AsRef<[u32]>>(
     out
 }
 
-/// An array of int32 `(n,)` as NumPy reads it (format version 1.0).
+/// Writes an array of int32 `(n,)` in NumPy's format (version 1.0).
 ///
 /// ```
 /// let bytes = coseg_geometry::mesh::write::npy(&[1, -1]);
@@ -185,7 +185,7 @@ pub fn npy(values: &[i32]) -> Vec<u8> {
     out
 }
 
-/// The label of each polygon, one a line, as in Princeton's `.seg` files.
+/// Writes the label of each polygon, one on each line, like Princeton's `.seg` files.
 ///
 /// ```
 /// assert_eq!(coseg_geometry::mesh::write::seg(&[0, 0, 3]), "0\n0\n3\n");

@@ -1,9 +1,9 @@
-//! Labelled polygons become a text file of Universal Scene Description: a mesh with a `GeomSubset` and a
-//! material for each label.
+//! Writes labelled polygons as a text file of Universal Scene Description: a mesh with a
+//! `GeomSubset` and a material for each label.
 
 use super::{append, by_label};
 
-/// A name as USD allows it: letters, digits and underscores, no digit first.
+/// A name in the syntax of USD: letters, digits and underscores, no digit first.
 fn identifier(name: &str) -> String {
     let valid = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
     let mut out: String = name.chars().map(valid).collect();
@@ -27,7 +27,8 @@ fn list<T: std::fmt::Display>(out: &mut String, values: impl IntoIterator<Item =
     out.push(']');
 }
 
-/// What a stage says of its up axis, and how its root turns a mesh with another one: USD knows Y and Z.
+/// The up axis of a stage, and the rotation of its root for a mesh with another axis: USD has Y and
+/// Z only.
 fn upright(up: Option<[f64; 3]>) -> (&'static str, &'static str) {
     const Y: &str = "    upAxis = \"Y\"\n";
     match up.map(|up| up.map(|x| x as i8)) {
@@ -41,9 +42,10 @@ fn upright(up: Option<[f64; 3]>) -> (&'static str, &'static str) {
     }
 }
 
-/// A `.usda` file of one mesh, called `name` as far as USD allows. `material` gives the name and
-/// sRGB colour of a label. Faces keep their order; `primvars:label` has the label of each. The
-/// stage has the coordinate axis `up`, if it is known, and takes a unit for a metre, as glTF does.
+/// Writes a `.usda` file of one mesh, called `name` as far as USD allows. `material` returns the
+/// name and sRGB colour of a label. Faces keep their order; `primvars:label` has the label of each.
+/// The stage has the coordinate axis `up`, if it is known, and interprets a unit as a metre, like
+/// glTF.
 ///
 /// ```
 /// use coseg_geometry::mesh::{icosphere, write};

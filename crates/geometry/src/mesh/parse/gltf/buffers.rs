@@ -1,4 +1,5 @@
-//! Accessors of a glTF file become numbers: every range is checked before anything is read or allocated.
+//! Reads the numbers of the accessors of a glTF file; every range is checked before it is read or
+//! allocated.
 
 use super::super::{ParseError, shown};
 use super::document::{Accessor, Buffer, Document, View, Whole, named};
@@ -16,23 +17,23 @@ const BASE64: GeneralPurpose = GeneralPurpose::new(
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
 );
 
-/// The data of a file, or why it has none.
+/// The data of a file, or the reason why it has none.
 pub(super) struct Buffers<'a> {
     document: &'a Document,
     data: Vec<Result<Cow<'a, [u8]>, ParseError>>,
-    /// Views that were compressed, once they have been asked for.
+    /// Decompressed views; each is filled at its first use.
     decoded: Vec<OnceCell<Result<Vec<u8>, ParseError>>>,
     n_decoded: Cell<usize>,
 }
 
-/// Where the entries of an accessor are: in a view from `offset` on.
+/// The range of the entries of an accessor: in a view from `offset` on.
 struct Range<'a> {
     view: Whole,
-    /// What names the view.
+    /// The location that refers to the view.
     named: &'a str,
     offset: usize,
     count: usize,
-    /// Whether entries may lie apart.
+    /// Whether entries may have gaps between them.
     strides: bool,
 }
 
@@ -51,12 +52,13 @@ impl<'a> Buffers<'a> {
         }
     }
 
-    /// Bytes that compressed views have become.
+    /// Number of bytes of decompressed views.
     pub(super) fn n_decoded(&self) -> usize {
         self.n_decoded.get()
     }
 
-    /// Decodes the view of an accessor, if it is compressed: what it holds counts as part of the file.
+    /// Decompresses the view of an accessor, if it is compressed: its contents count as part of the
+    /// file.
     pub(super) fn prepare(&self, accessor: &Accessor) {
         if let Some(view) = accessor.buffer_view {
             // An error is reported where the accessor is read.
@@ -64,7 +66,7 @@ impl<'a> Buffers<'a> {
         }
     }
 
-    /// Positions that an accessor holds; normalised integers are in −1 to 1.
+    /// The positions of an accessor; normalised integers are in −1 to 1.
     pub(super) fn positions(&self, accessor: Whole) -> Result<Vec<[f64; 3]>, ParseError> {
         let wrong = || {
             fault(
@@ -100,7 +102,7 @@ impl<'a> Buffers<'a> {
         Ok(values.into_iter().map(|point| point.map(real)).collect())
     }
 
-    /// Indices that an accessor holds.
+    /// The indices of an accessor.
     pub(super) fn indices(&self, accessor: Whole) -> Result<Vec<u32>, ParseError> {
         let it = &self.document.accessors[accessor.0];
         let scalar = it.dimensions == "SCALAR";
@@ -120,9 +122,9 @@ impl<'a> Buffers<'a> {
         Ok(values.into_iter().map(Into::into).collect())
     }
 
-    /// The entries of an accessor, with its sparse ones in their places.
+    /// The entries of an accessor, including its sparse ones.
     fn values<T: Pod>(&self, accessor: Whole) -> Result<Vec<T>, ParseError> {
-        let (it, place) = (
+        let (it, location) = (
             &self.document.accessors[accessor.0],
             format!("accessor {}", accessor.0),
         );
@@ -137,9 +139,9 @@ impl<'a> Buffers<'a> {
                     count,
                     strides: true,
                 };
-                self.entries(&range, &place)?
+                self.entries(&range, &location)?
             }
-            // All zeros; the caller has bounded their number.
+            // An accessor without a view is all zeros; the caller has bounded their number.
             None => vec![T::zeroed(); count],
         };
         let Some(sparse) = &it.sparse else {
@@ -148,7 +150,7 @@ impl<'a> Buffers<'a> {
         let n = values.len();
         if sparse.count.0 > n {
             let why = format!("replaces {} entries, but has {n}", sparse.count.0);
-            return Err(fault(place, why));
+            return Err(fault(location, why));
         }
         let at = Range {
             view: sparse.indices.buffer_view,
@@ -159,12 +161,12 @@ impl<'a> Buffers<'a> {
         };
         let code = sparse.indices.component_type;
         let at: Vec<u32> = match component(code, || path("sparse.indices"))? {
-            Component::U8 => widened(self.entries::<u8>(&at, &place)?),
-            Component::U16 => widened(self.entries::<u16>(&at, &place)?),
-            Component::U32 => self.entries::<u32>(&at, &place)?,
+            Component::U8 => widened(self.entries::<u8>(&at, &location)?),
+            Component::U16 => widened(self.entries::<u16>(&at, &location)?),
+            Component::U32 => self.entries::<u32>(&at, &location)?,
             _ => {
                 return Err(fault(
-                    place,
+                    location,
                     "has sparse indices that are no unsigned integers",
                 ));
             }
@@ -176,17 +178,16 @@ impl<'a> Buffers<'a> {
             count: sparse.count.0,
             strides: false,
         };
-        for (at, value) in at.into_iter().zip(self.entries(&replacements, &place)?) {
-            *values
-                .get_mut(at as usize)
-                .ok_or_else(|| fault(&place, format_args!("replaces entry {at}, but has {n}")))? =
-                value;
+        for (at, value) in at.into_iter().zip(self.entries(&replacements, &location)?) {
+            *values.get_mut(at as usize).ok_or_else(|| {
+                fault(&location, format_args!("replaces entry {at}, but has {n}"))
+            })? = value;
         }
         Ok(values)
     }
 
-    /// The entries of a range, all of which are there.
-    fn entries<T: Pod>(&self, range: &Range<'_>, place: &str) -> Result<Vec<T>, ParseError> {
+    /// The entries of a range, all of which must exist.
+    fn entries<T: Pod>(&self, range: &Range<'_>, location: &str) -> Result<Vec<T>, ParseError> {
         let size = size_of::<T>();
         let (view, bytes) = self.view(range.view, range.named)?;
         let compressed = view.compressed().map(|c| c.byte_stride);
@@ -205,7 +206,7 @@ impl<'a> Buffers<'a> {
         let found = needed.and_then(|needed| part(bytes, range.offset, needed));
         let found = found.ok_or_else(|| {
             fault(
-                place,
+                location,
                 format_args!(
                     "has {} entries from byte {} on, but buffer view {} has {} bytes",
                     range.count,
@@ -219,22 +220,23 @@ impl<'a> Buffers<'a> {
         Ok((0..range.count).map(entry).collect())
     }
 
-    /// A view and its bytes; `named_by` is the place that names it.
+    /// A view and its bytes; `named_by` is the location that refers to it.
     fn view(&self, index: Whole, named_by: &str) -> Result<(&View, &[u8]), ParseError> {
         let view = named(&self.document.buffer_views, index, "buffer view", named_by)?;
-        let place = || format!("bufferViews[{}]", index.0);
+        let location = || format!("bufferViews[{}]", index.0);
         let stored = || self.stored(view.buffer, view.byte_offset, view.byte_length, index);
         let Some(packed) = view.compressed() else {
             return stored().map(|bytes| (view, bytes));
         };
-        // A file may have what is compressed a second time as it is, for readers that do not know how.
+        // A file may also contain a compressed view in plain form, for readers without the decoder.
         if let Ok(bytes) = stored() {
             return Ok((view, bytes));
         }
         let decoded = self.decoded[index.0].get_or_init(|| {
             let bytes =
                 self.stored(packed.buffer, packed.byte_offset, packed.byte_length, index)?;
-            let decoded = compressed::decode(packed, bytes).map_err(|why| fault(place(), why))?;
+            let decoded =
+                compressed::decode(packed, bytes).map_err(|why| fault(location(), why))?;
             self.n_decoded.set(self.n_decoded.get() + decoded.len());
             Ok(decoded)
         });
@@ -244,7 +246,7 @@ impl<'a> Buffers<'a> {
             .map_err(Clone::clone)
     }
 
-    /// Bytes of a buffer that a view says it has.
+    /// The bytes of a buffer that belong to a view.
     fn stored(
         &self,
         buffer: Whole,
@@ -278,25 +280,25 @@ fn widened<T: Into<u32>>(values: Vec<T>) -> Vec<u32> {
     values.into_iter().map(Into::into).collect()
 }
 
-/// The bytes of a buffer, as many as it declares.
+/// The bytes of a buffer, of its declared length.
 fn data<'a>(
     index: usize,
     buffer: &Buffer,
     binary: Option<&'a [u8]>,
 ) -> Result<Cow<'a, [u8]>, ParseError> {
-    let place = format!("buffer {index}");
+    let location = format!("buffer {index}");
     let bytes = match &buffer.uri {
-        Some(uri) => Some(Cow::Owned(data_uri(uri, &place)?)),
+        Some(uri) => Some(Cow::Owned(data_uri(uri, &location)?)),
         None if index == 0 => binary.map(Cow::Borrowed),
         None => None,
     };
-    let bytes = bytes.ok_or_else(|| fault(&place, "has no data in the file"))?;
+    let bytes = bytes.ok_or_else(|| fault(&location, "has no data in the file"))?;
     // A binary chunk may be padded beyond the buffer.
     let declared = buffer.byte_length.0;
     if declared > bytes.len() {
         let found = bytes.len();
         let why = format!("declares {declared} bytes, but has {found}");
-        return Err(fault(&place, why));
+        return Err(fault(&location, why));
     }
     Ok(match bytes {
         Cow::Borrowed(bytes) => Cow::Borrowed(&bytes[..declared]),
@@ -317,7 +319,7 @@ enum Component {
     F32,
 }
 
-fn component(code: Whole, place: impl Fn() -> String) -> Result<Component, ParseError> {
+fn component(code: Whole, location: impl Fn() -> String) -> Result<Component, ParseError> {
     Ok(match code.0 {
         5120 => Component::I8,
         5121 => Component::U8,
@@ -326,9 +328,9 @@ fn component(code: Whole, place: impl Fn() -> String) -> Result<Component, Parse
         5125 => Component::U32,
         5126 => Component::F32,
         other => {
-            let place = format!("{}.componentType", place());
+            let location = format!("{}.componentType", location());
             return Err(fault(
-                place,
+                location,
                 format_args!("is {other}, which glTF does not know"),
             ));
         }
@@ -339,8 +341,8 @@ fn part(bytes: &[u8], offset: usize, length: usize) -> Option<&[u8]> {
     bytes.get(offset..offset.checked_add(length)?)
 }
 
-/// The bytes of a `data:` URI; no other is followed.
-fn data_uri(uri: &str, place: &str) -> Result<Vec<u8>, ParseError> {
+/// The bytes of a `data:` URI; other URIs are not followed.
+fn data_uri(uri: &str, location: &str) -> Result<Vec<u8>, ParseError> {
     let is_data = uri
         .get(..5)
         .is_some_and(|start| start.eq_ignore_ascii_case("data:"));
@@ -350,9 +352,9 @@ fn data_uri(uri: &str, place: &str) -> Result<Vec<u8>, ParseError> {
             "is in another file (\"{shown}\"), which is not sent along: `coseg add` and the clients pack \
              both into one when they are given the path; or export a single .glb"
         );
-        return Err(fault(place, why));
+        return Err(fault(location, why));
     }
-    let wrong = || fault(place, "has a data URI that is not valid base64");
+    let wrong = || fault(location, "has a data URI that is not valid base64");
     let (kind, text) = uri[5..].split_once(',').ok_or_else(wrong)?;
     let plain = Cow::from(percent_decode_str(text));
     if kind.to_ascii_lowercase().ends_with(";base64") {

@@ -1,12 +1,12 @@
-//! Views compressed by `EXT_meshopt_compression` become the bytes they stand for, by `meshopt`.
+//! Decompresses views of `EXT_meshopt_compression` by `meshopt`.
 
 use super::document::Compressed;
 use meshopt::{
     decode_filter_exp, decode_index_buffer, decode_index_sequence, decode_vertex_buffer,
 };
 
-/// Bytes that a compressed one may become, and bytes beyond that: what is measured takes at least one for
-/// each triangle and three for each vertex.
+/// Limits on the size of decompressed views: a ratio, and bytes beyond it. A real mesh takes at
+/// least one compressed byte for each triangle and three for each vertex.
 const MAX_RATIO: usize = 64;
 const ALLOWANCE: usize = 1 << 16;
 
@@ -21,7 +21,7 @@ impl<const N: usize> Default for Entry<N> {
     }
 }
 
-/// What a view holds, or why it cannot be told.
+/// The contents of a view, or the error of its decoder.
 pub(super) fn decode(view: &Compressed, bytes: &[u8]) -> Result<Vec<u8>, String> {
     let (stride, count) = (view.byte_stride.0, view.count.0);
     let most = bytes
@@ -66,7 +66,7 @@ pub(super) fn decode(view: &Compressed, bytes: &[u8]) -> Result<Vec<u8>, String>
             decode_filter_exp(&mut words);
             decoded = bytemuck::cast_slice(&words).to_vec();
         }
-        // Those of normals and rotations.
+        // The filters of normals and rotations.
         Some(other) => {
             let other: String = other.chars().take(20).collect();
             return Err(format!(
@@ -81,7 +81,7 @@ fn raw<T: bytemuck::NoUninit>(values: Vec<T>) -> Vec<u8> {
     bytemuck::cast_slice(&values).to_vec()
 }
 
-/// Entries whose size is known when the program runs, by a decoder for each.
+/// Decodes entries of a size known only at run time, by a decoder for each size.
 fn vertices(bytes: &[u8], count: usize, stride: usize) -> meshopt::Result<Vec<u8>> {
     macro_rules! by_words {
         ($($words:literal)+) => {

@@ -1,9 +1,9 @@
-//! The JSON of a glTF file, as far as its triangles depend on it.
+//! Reads the parts of the JSON of a glTF file that determine its triangles.
 //!
-//! Everything else is passed over unread, whatever it holds: animations, materials, cameras, skins,
-//! `extras`, extensions, attributes other than positions. So a file is never refused for a part that is
-//! not needed. Transforms are read in double precision: parts of an assembly that lies far from the
-//! origin would lose their places against each other.
+//! Everything else is skipped, whatever it holds: animations, materials, cameras, skins, `extras`,
+//! extensions, attributes other than positions. So a file is never refused for a part that is not
+//! needed. Transforms are read in double precision: in single precision, parts of an assembly that
+//! lies far from the origin would lose their relative positions.
 
 use super::super::{ParseError, shown};
 use super::fault;
@@ -12,9 +12,9 @@ use serde::de::{Error, IgnoredAny, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer};
 use std::fmt;
 
-/// Objects that are read from the JSON; each is many times as large in memory as in the file.
+/// The largest number of objects in the JSON; each takes many times as much memory as in the file.
 const MAX_OBJECTS: usize = 1_000_000;
-/// Required extensions that leave triangles where they are, by what their names begin with.
+/// Prefixes of required extensions that do not affect triangles.
 const HARMLESS: [&str; 20] = [
     "ADOBE_materials_",
     "CESIUM_primitive_outline",
@@ -38,7 +38,7 @@ const HARMLESS: [&str; 20] = [
     "MSFT_texture_",
 ];
 
-/// An index, a count or a code. JSON has one kind of number, so that `3.0` is one too.
+/// An index, a count or a code. JSON has one kind of number, so `3.0` is accepted too.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Whole(pub(super) usize);
 
@@ -59,7 +59,7 @@ impl<'de> Deserialize<'de> for Whole {
             }
 
             fn visit_f64<E: Error>(self, value: f64) -> Result<Whole, E> {
-                // Beyond 2^53 a double no longer tells whole numbers apart.
+                // Beyond 2^53 a double no longer distinguishes whole numbers.
                 if value.fract() == 0.0 && (0.0..=9_007_199_254_740_992.0).contains(&value) {
                     return self.visit_u64(value as u64);
                 }
@@ -107,7 +107,7 @@ pub(super) struct Node {
     pub(super) mesh: Option<Whole>,
     #[serde(default)]
     pub(super) children: Vec<Whole>,
-    /// Column-major; in the place of the other three.
+    /// Column-major; replaces the other three.
     matrix: Option<Box<[f64; 16]>>,
     translation: Option<Box<[f64; 3]>>,
     /// Unit quaternion x, y, z, w.
@@ -121,7 +121,7 @@ impl Node {
             return Matrix4::from_column_slice(&columns[..]);
         }
         let three = |v: &Option<Box<[f64; 3]>>, or: f64| v.as_deref().copied().unwrap_or([or; 3]);
-        // As written, not made a unit: a rotation that is none scales.
+        // The quaternion is not normalised: one of another length scales.
         let rotation = self.rotation.as_deref().copied();
         let rotation = Quaternion::from(rotation.unwrap_or([0.0, 0.0, 0.0, 1.0]));
         Translation3::from(three(&self.translation, 0.0)).to_homogeneous()
@@ -158,7 +158,7 @@ struct PrimitiveExtensions {
 }
 
 impl Primitive {
-    /// The accessor of positions; without one nothing is drawn.
+    /// The accessor of positions; without one the primitive has no triangles.
     pub(super) fn positions(&self) -> Option<Whole> {
         self.attributes.positions
     }
@@ -200,7 +200,7 @@ pub(super) struct SparsePart {
     pub(super) buffer_view: Whole,
     #[serde(default)]
     pub(super) byte_offset: Whole,
-    /// Of indices only.
+    /// For indices only.
     #[serde(default)]
     pub(super) component_type: Whole,
 }
@@ -222,7 +222,7 @@ struct ViewExtensions {
     meshopt: Option<Compressed>,
 }
 
-/// Where the entries of a view are kept compressed by meshopt.
+/// The range of a view that is compressed by meshopt.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Compressed {
@@ -250,16 +250,16 @@ pub(super) struct Buffer {
     pub(super) uri: Option<String>,
 }
 
-/// The entry of a list that `place` names by its index.
+/// The entry of a list at an index, which `location` names.
 pub(super) fn named<'a, T>(
     list: &'a [T],
     index: Whole,
     what: &str,
-    place: impl fmt::Display,
+    location: impl fmt::Display,
 ) -> Result<&'a T, ParseError> {
     list.get(index.0).ok_or_else(|| {
         let why = format!("names {what} {}, but the file has {}", index.0, list.len());
-        fault(place, why)
+        fault(location, why)
     })
 }
 
@@ -268,7 +268,7 @@ impl Document {
         let no_json = |error: serde_json::Error| ParseError::Json {
             reason: error.to_string(),
         };
-        // Most files have few, whatever they are.
+        // Most files have few braces, so this cheap test suffices for them.
         if text.iter().filter(|&&b| b == b'{').count() > MAX_OBJECTS {
             let extent: Extent = serde_json::from_slice(text).map_err(no_json)?;
             let n_objects = extent.n_objects();

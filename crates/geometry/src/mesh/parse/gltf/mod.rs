@@ -1,12 +1,13 @@
-//! glTF 2.0, as JSON or in one binary file (GLB): the triangles of its default scene.
+//! Reads glTF 2.0, as JSON or in one binary file (GLB): the triangles of its default scene.
 //!
-//! Only what triangles depend on is read (see `document`): the crate `gltf` checks all of a file, and
-//! refuses valid ones for parts that are of no account here.
+//! It reads only the parts that determine triangles (see `document`): the crate `gltf` checks all
+//! of a file, and refuses valid ones for parts that do not matter here.
 //!
-//! Faces come in this order: nodes depth first, a node's mesh before its children, both in the order of
-//! the file; a mesh's primitives in order; a primitive's triangles in order. Each triangle is a face. A
-//! mesh that several nodes place is read once for each; without any nodes each mesh is read once. Points
-//! and lines are no faces; skins and morph targets are not applied. Nothing outside the file is read.
+//! Faces come in this order: nodes depth first, a node's mesh before its children, both in the
+//! order of the file; a mesh's primitives in order; a primitive's triangles in order. Each triangle
+//! is a face. A mesh that several nodes place is read once for each of them; without any nodes each
+//! mesh is read once. Points and lines are ignored; skins and morph targets are not applied. No
+//! other file is read.
 
 mod buffers;
 mod compressed;
@@ -21,16 +22,16 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
-/// Vertices and corners that a scene may place beyond one for each two bytes of its file: nodes that place
-/// one mesh again and again could make a small file as large as they like.
+/// Vertices and corners that a scene may place beyond one for each two bytes of its file. Without a
+/// limit, nodes that place one mesh repeatedly could make a small file as large as they like.
 const ALLOWANCE: u64 = 1 << 16;
-/// The words that a binary file begins with, and that its chunks have in front.
+/// Bytes of the header of a binary file, and of each of its chunks.
 const HEADER: usize = 12;
 const CHUNK_HEADER: usize = 8;
 
-fn fault(place: impl ToString, why: impl ToString) -> ParseError {
+fn fault(location: impl ToString, why: impl ToString) -> ParseError {
     ParseError::Gltf {
-        place: place.to_string(),
+        location: location.to_string(),
         why: why.to_string(),
     }
 }
@@ -50,8 +51,8 @@ fn container(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
     })
 }
 
-/// The chunks of a GLB: JSON, then perhaps one of data. Chunks of other kinds, and what follows the length
-/// that the header gives, are passed over.
+/// The chunks of a GLB: JSON, then optionally one of data. Chunks of other kinds are skipped, and
+/// so are bytes beyond the length in the header.
 fn binary(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
     let word = |at: usize| -> Result<usize, ParseError> {
         let word = bytes.get(at..at + 4).and_then(|w| w.try_into().ok());
@@ -100,18 +101,19 @@ fn binary(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
     }
 }
 
-/// The scene as it is put together.
+/// The scene during its assembly.
 struct Scene<'a> {
     document: &'a Document,
     buffers: Buffers<'a>,
     polygons: Polygons,
-    /// Vertices and corners placed, and bytes of the file.
+    /// Vertices and corners placed so far, and bytes of the file.
     n_placed: u64,
     n_bytes: u64,
 }
 
 impl Scene<'_> {
-    /// Vertices and corners that may be placed. What is compressed counts as if it were not.
+    /// Largest number of vertices and corners that may be placed. Compressed data count at their
+    /// full size.
     fn limit(&self) -> u64 {
         ALLOWANCE + (self.n_bytes + self.buffers.n_decoded() as u64) / 2
     }
@@ -132,11 +134,11 @@ impl Scene<'_> {
     }
 
     fn mesh(&mut self, index: Whole, mesh: &Mesh, to: &Matrix4<f64>) -> Result<(), ParseError> {
-        // Where the positions of each accessor begin, once placed.
+        // The first vertex of each accessor's positions, once placed.
         let mut bases = BTreeMap::new();
         for (i, primitive) in mesh.primitives.iter().enumerate() {
-            let place = format!("meshes[{}].primitives[{i}]", index.0);
-            self.primitive(primitive, &place, to, &mut bases)?;
+            let location = format!("meshes[{}].primitives[{i}]", index.0);
+            self.primitive(primitive, &location, to, &mut bases)?;
         }
         Ok(())
     }
@@ -144,7 +146,7 @@ impl Scene<'_> {
     fn primitive(
         &mut self,
         primitive: &Primitive,
-        place: &str,
+        location: &str,
         transform: &Matrix4<f64>,
         bases: &mut BTreeMap<usize, u32>,
     ) -> Result<(), ParseError> {
@@ -155,14 +157,14 @@ impl Scene<'_> {
             6 => Mode::Fan,
             other => {
                 let why = format!("is {other}, which glTF does not know");
-                return Err(fault(format_args!("{place}.mode"), why));
+                return Err(fault(format_args!("{location}.mode"), why));
             }
         };
         let Some(index) = primitive.positions() else {
             return Ok(());
         };
         let accessors = &self.document.accessors;
-        let by = format!("{place}.attributes.POSITION");
+        let by = format!("{location}.attributes.POSITION");
         let positions = named(accessors, index, "accessor", by)?;
         if primitive.is_draco() && positions.buffer_view.is_none() {
             return Err(ParseError::Unsupported {
@@ -173,7 +175,7 @@ impl Scene<'_> {
         let indices = match primitive.indices {
             None => None,
             Some(index) => {
-                let by = format!("{place}.indices");
+                let by = format!("{location}.indices");
                 Some((index, named(accessors, index, "accessor", by)?))
             }
         };
@@ -215,7 +217,7 @@ impl Scene<'_> {
             Mode::Triangles => n_corners / 3,
             _ => n_corners.saturating_sub(2),
         };
-        // Where left and right are exchanged, faces turn inside out.
+        // A transform that exchanges left and right turns faces inside out.
         let mirrors = transform.fixed_view::<3, 3>(0, 0).determinant() < 0.0;
         for i in 0..n_triangles {
             let [a, mut b, mut c] = match mode {
@@ -239,7 +241,7 @@ impl Scene<'_> {
     }
 }
 
-/// How corners are put together.
+/// How corners form triangles.
 #[derive(Clone, Copy, PartialEq)]
 enum Mode {
     Triangles,
@@ -247,7 +249,7 @@ enum Mode {
     Fan,
 }
 
-/// Nodes that are placed alike, and where the next one is.
+/// Nodes at one level of the hierarchy with the same transform, and the index of the next one.
 struct Level<'a> {
     list: List,
     nodes: &'a [Whole],
@@ -255,7 +257,7 @@ struct Level<'a> {
     transform: Matrix4<f64>,
 }
 
-/// What lists nodes.
+/// The kind of list that names nodes.
 #[derive(Clone, Copy)]
 enum List {
     Scene(usize),
@@ -273,7 +275,7 @@ impl fmt::Display for List {
     }
 }
 
-/// The nodes a scene begins with: of the default scene, of the first one, or all that are nobody's children.
+/// The root nodes: those of the default scene, or of the first one, or all nodes without a parent.
 fn roots(document: &Document) -> Result<(List, Cow<'_, [Whole]>), ParseError> {
     if document.scene.is_some() || !document.scenes.is_empty() {
         let index = document.scene.unwrap_or_default();
@@ -337,7 +339,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         });
     }
     if document.scenes.is_empty() && document.nodes.is_empty() {
-        // A file that places nothing is a store of meshes.
+        // A file without nodes is a collection of meshes.
         for (i, mesh) in document.meshes.iter().enumerate() {
             scene.mesh(Whole(i), mesh, &Matrix4::identity())?;
         }

@@ -1,4 +1,5 @@
-//! Files that are valid and unusual: whatever triangles do not depend on may be there, be missing or be new.
+//! Files that are valid and unusual: parts that do not affect triangles may be present, missing or
+//! of new kinds.
 
 use crate::mesh::parse::gltf_tests::{SQUARE, binary, glb, json};
 use crate::mesh::parse::{ParseError, parse};
@@ -14,7 +15,7 @@ fn read(json: &str) -> Result<ParsedMesh, ParseError> {
     gltf(&glb(json, &binary()))
 }
 
-/// The square, by whatever text: as plain as can be.
+/// The square from the simplest text.
 fn square() -> ParsedMesh {
     read(&json(NODE, SQUARE, "", "")).unwrap()
 }
@@ -38,7 +39,7 @@ fn parts_that_are_not_needed_may_hold_anything() {
     ] {
         assert_eq!(read(&json(NODE, SQUARE, "", more)), Ok(square()), "{more}");
     }
-    // Deeper than a reader that builds a tree would go.
+    // This is deeper than a reader that builds a tree can handle.
     let deep = format!(r#","extras":{}{}"#, "[".repeat(5_000), "]".repeat(5_000));
     assert_eq!(read(&json(NODE, SQUARE, "", &deep)), Ok(square()));
 }
@@ -85,7 +86,7 @@ fn attributes_of_an_application_and_of_the_future_are_passed_over() {
             "{attribute}"
         );
     }
-    // Accessors that no triangle needs may have types that are new, and lead nowhere.
+    // Accessors that no triangle needs may have new types and refer to missing parts.
     let strange = r#",{"componentType":5130,"type":"VEC5","count":0,"bufferView":70}"#;
     assert_eq!(read(&json(NODE, SQUARE, strange, "")), Ok(square()));
     // So may nodes that name cameras, skins and weights.
@@ -99,7 +100,7 @@ fn scenes_may_lack_nodes_and_files_scenes() {
     let scenes = |scenes: &str| whole.replace(r#""scene":0,"scenes":[{"nodes":[0]}]"#, scenes);
     let second = r#""scene":1,"scenes":[{"name":"none"},{"nodes":[0,1]}]"#;
     assert_eq!(read(&scenes(second)), Ok(square()));
-    // Two scenes: the default one alone is read.
+    // Of two scenes only the default one is read.
     let both = r#""scene":1,"scenes":[{"nodes":[1]},{"nodes":[1]}]"#;
     assert_eq!(read(&scenes(both)), Ok(square()));
     let message = |text: &str| read(&scenes(text)).unwrap_err().to_string();
@@ -114,7 +115,7 @@ fn scenes_may_lack_nodes_and_files_scenes() {
         message(r#""scene":0,"scenes":[{"nodes":[9]}]"#),
         "scenes[0].nodes[0] names node 9, but the file has 2"
     );
-    // A store of meshes, which places nothing.
+    // A collection of meshes, without nodes.
     let store = json(NODE, SQUARE, "", "").replace(r#""nodes":[{"mesh":0}],"#, "");
     assert_eq!(
         read(&store.replace(r#""scene":0,"scenes":[{"nodes":[0]}],"#, "")),
@@ -221,7 +222,7 @@ fn a_file_without_the_buffers_that_it_needs_says_which() {
         read(&without).unwrap_err().to_string(),
         "bufferViews[0].buffer names buffer 0, but the file has 0"
     );
-    // One that no triangle needs may be anywhere.
+    // A node that no triangle needs may be anywhere.
     let more = whole.replace(
         r#""buffers":[{"byteLength":72}]"#,
         r#""buffers":[{"byteLength":72},{"byteLength":7,"uri":"https://example.com/x.bin"}]"#,
@@ -247,7 +248,7 @@ fn compression_by_draco_is_refused_by_name_unless_there_is_a_way_around_it() {
     );
 }
 
-/// The square with both of its views compressed, in a file whose second buffer is a stand-in.
+/// The square with both of its views compressed, in a file whose second buffer has a plain copy.
 fn compressed(name: &str, filter: &str, positions: &[u8], indices: &[u8]) -> (String, Vec<u8>) {
     let mut binary = positions.to_vec();
     binary.resize(positions.len().next_multiple_of(4), 0);
@@ -316,7 +317,7 @@ fn compression_by_meshopt_is_read() {
         for byte in [0, 1, 0x7f, 0xff] {
             let mut damaged = binary.clone();
             damaged[at] = byte;
-            // Refused or read: nothing else.
+            // The result may be an error or a mesh; it must not panic.
             let _ = gltf(&glb(&text, &damaged));
         }
     }
