@@ -1,7 +1,7 @@
-//! Defaults, a file, the environment and flags become one validated [`Config`].
+//! Merges defaults, a file, the environment and flags into one validated [`Config`].
 //!
-//! The compiled-in default is `config/coseg.toml` itself, so its comments cannot drift from the code:
-//! a key is known if and only if that file has it.
+//! The compiled-in default is `config/coseg.toml` itself, so its comments cannot drift from the
+//! code: a key is known if and only if that file has it.
 
 mod size;
 pub use size::ByteSize;
@@ -14,24 +14,24 @@ use std::path::PathBuf;
 
 /// The default settings, commented.
 pub const DEFAULT: &str = include_str!("../config/coseg.toml");
-/// Read if it exists and no other file is named.
+/// The file that is read if it exists and no other file is named.
 pub const SYSTEM_FILE: &str = "/etc/coseg/coseg.toml";
-/// What environment variables of settings begin with: `COSEG__SECTION__KEY`.
+/// Prefix of environment variables for settings: `COSEG__SECTION__KEY`.
 const ENV_PREFIX: &str = "COSEG";
 const ENV_SEPARATOR: &str = "__";
-/// Bytes that describing a shape takes whatever its size, and per byte of its file: text of about 30
-/// bytes a vertex and 20 a face becomes parsed, cleaned and indexed copies, then a proxy of fixed size
-/// with its spectrum.
+/// Memory that describing a shape takes regardless of its size, and memory for each byte of its
+/// file. Text of about 30 bytes for each vertex and 20 for each face becomes parsed, cleaned and
+/// indexed copies, then a proxy of fixed size with its spectrum.
 const DESCRIBE_BASE: u64 = 64 << 20;
 const DESCRIBE_PER_BYTE: u64 = 12;
-/// Bytes that frames of a message take beside what is in them.
+/// Memory that the frames of a message take besides their contents.
 const ARRIVING_BASE: u64 = 8 << 20;
-/// Bytes that a connection takes, whatever comes over it: 24 kB were measured.
+/// Memory that a connection takes, regardless of its messages: 24 kB were measured.
 const CONNECTION: u64 = 32 << 10;
 /// Memory below which no shape could be described.
 const MIN_MEMORY: u64 = 256 << 20;
 
-/// Why there is no usable configuration.
+/// The reason why there is no usable configuration.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum ConfigError {
@@ -50,23 +50,23 @@ pub enum ConfigError {
 /// All settings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Config {
-    /// Where the daemon listens and keeps things.
+    /// The addresses and the folder of the daemon.
     pub server: Server,
-    /// What browsers and monitoring reach.
+    /// The endpoint for browsers and monitoring.
     pub http: Http,
-    /// How work is done.
+    /// The work on shapes.
     pub work: Work,
-    /// What is refused beyond.
+    /// The limits beyond which requests are refused.
     pub limits: Limits,
-    /// What may come in.
+    /// The sources of shapes.
     pub ingest: Ingest,
-    /// Who may connect.
+    /// Access control.
     pub security: Security,
-    /// What is told to the operator.
+    /// The log for the operator.
     pub log: Log,
 }
 
-/// Where the daemon listens and keeps things.
+/// The addresses and the folder of the daemon.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Server {
     /// URI of the request socket; empty: the default.
@@ -75,24 +75,24 @@ pub struct Server {
     pub library: PathBuf,
 }
 
-/// What browsers and monitoring reach.
+/// The endpoint for browsers and monitoring.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Http {
-    /// HOST:PORT to listen at; empty: nowhere.
+    /// HOST:PORT to listen at; empty: no endpoint.
     pub listen: String,
-    /// Whether that may be an address that other machines reach.
+    /// Whether `listen` may be an address that other machines reach.
     pub allow_remote: bool,
     /// Whether the viewer may change labels.
     pub edit: bool,
-    /// File of the token that is asked for; empty: none on loopback, beyond it one in the folder of
-    /// the library.
+    /// File of the token that clients must send; empty: no token on loopback, and one in the folder
+    /// of the library beyond it.
     pub token_file: PathBuf,
     /// Whether monitoring needs no token.
     pub open_monitoring: bool,
 }
 
 impl Http {
-    /// The address to listen at, if there is one; `localhost` is 127.0.0.1.
+    /// The address to listen at, if one is set; `localhost` is 127.0.0.1.
     pub fn address(&self) -> Result<Option<SocketAddr>, ConfigError> {
         if self.listen.is_empty() {
             return Ok(None);
@@ -118,74 +118,74 @@ impl Http {
     }
 }
 
-/// How work is done.
+/// The work on shapes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Work {
-    /// Threads that describe shapes; 0: one for each processor.
+    /// Number of threads that describe shapes; 0: one for each processor.
     pub workers: usize,
-    /// Seconds that describing one shape may take.
+    /// Time limit in seconds for describing one shape.
     pub shape_seconds: u64,
 }
 
-/// What is refused beyond.
+/// The limits beyond which requests are refused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Limits {
-    /// Memory for requests and work in hand.
+    /// Memory for requests and unfinished work.
     pub memory: ByteSize,
-    /// Bytes of one message.
+    /// Maximum size of one message.
     pub max_message: ByteSize,
-    /// Bytes of one shape's file.
+    /// Maximum size of one shape's file.
     pub max_shape: ByteSize,
-    /// Shapes of one request.
+    /// Maximum number of shapes of one request.
     pub max_shapes_per_request: usize,
-    /// Accepted shapes that are not placed yet.
+    /// Maximum number of accepted shapes that are not yet placed.
     pub max_queued_shapes: usize,
-    /// Requests being answered or waiting for it.
+    /// Maximum number of requests that are being answered or wait for it.
     pub max_requests: usize,
-    /// The same, of one client.
+    /// Maximum number of these requests of one client.
     pub max_requests_per_client: usize,
-    /// Bytes of requests in hand of one client.
+    /// Maximum size of the unfinished requests of one client.
     pub max_bytes_per_client: ByteSize,
-    /// Bytes of the files of accepted shapes that are not placed yet.
+    /// Maximum size of the files of accepted shapes that are not yet placed.
     pub max_queued_bytes: ByteSize,
-    /// Seconds that placing all accepted shapes may take, as estimated.
+    /// Maximum estimated time in seconds for placing all accepted shapes.
     pub max_queued_seconds: u64,
 }
 
-/// What may come in.
+/// The sources of shapes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ingest {
     /// Directories below which AddShapes may name files.
     pub paths: Vec<PathBuf>,
 }
 
-/// Who may connect.
+/// Access control.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Security {
-    /// Folder of keys; empty: none.
+    /// Folder of keys; empty: no keys.
     pub keys: PathBuf,
 }
 
-/// What is told to the operator.
+/// The log for the operator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Log {
     /// A level or a filter.
     pub level: String,
-    /// How lines look.
+    /// The format of lines.
     pub format: LogFormat,
 }
 
-/// How log lines look.
+/// The formats of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// For people.
+    /// Text for people.
     Human,
-    /// One JSON object a line.
+    /// One JSON object on each line.
     Json,
 }
 
-/// What flags say, over file and environment.
+/// The values of flags, which override file and environment.
 #[derive(Debug, Clone, Default)]
 pub struct Overrides {
     /// `--config`.
@@ -215,7 +215,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// All layers, checked.
+    /// Merges all layers and validates the result.
     pub fn load(overrides: &Overrides) -> Result<Self, ConfigError> {
         let known = keys_of(
             &config::File::from_str(DEFAULT, FileFormat::Toml),
@@ -362,17 +362,17 @@ impl Config {
         Ok(())
     }
 
-    /// Whether every connection is to be encrypted and authenticated.
+    /// Whether every connection must be encrypted and authenticated.
     pub fn has_keys(&self) -> bool {
         !self.security.keys.as_os_str().is_empty()
     }
 
-    /// The library's folder: as set, or the default for this user.
+    /// The library's folder: the configured one, or the default for this user.
     pub fn library(&self) -> Result<PathBuf, ConfigError> {
         library_directory(Some(&self.server.library).filter(|p| !p.as_os_str().is_empty()))
     }
 
-    /// Threads that describe shapes.
+    /// Number of threads that describe shapes.
     pub fn n_workers(&self) -> usize {
         match self.work.workers {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
@@ -382,37 +382,39 @@ impl Config {
 }
 
 impl Limits {
-    /// Bytes set aside for requests that have arrived.
+    /// Bytes reserved for requests that have arrived.
     pub fn request_bytes(&self) -> u64 {
         self.memory.0 / 4
     }
 
-    /// Bytes set aside for messages that arrive, before they are looked at: at least one of the largest.
+    /// Bytes reserved for messages that are arriving, before they are read: at least one of the
+    /// largest.
     pub fn arriving_bytes(&self) -> u64 {
         (self.memory.0 / 8).max(self.max_message.0 + ARRIVING_BASE)
     }
 
-    /// Bytes set aside for replies that are not sent yet: at least one of the largest.
+    /// Bytes reserved for replies that are not yet sent: at least one of the largest.
     pub fn reply_bytes(&self) -> u64 {
         (self.memory.0 / 8).max(self.max_message.0)
     }
 
-    /// Connections at a time for which there is memory, beside messages.
+    /// Number of simultaneous connections for which there is memory, beside messages.
     pub fn connections(&self) -> u64 {
         self.memory.0 / 8 / CONNECTION
     }
 
-    /// Bytes set aside for shapes being described.
+    /// Bytes reserved for shapes that are being described.
     pub fn describe_bytes(&self) -> u64 {
         self.memory.0 / 2
     }
 
-    /// Bytes set aside for what HTTP has in hand: a share, and the largest answer at least.
+    /// Bytes reserved for the work of HTTP: a share, and at least the largest answer.
     pub fn http_bytes(&self) -> u64 {
         self.max_message.0.max(self.memory.0 / 8)
     }
 
-    /// Bytes of one shape's file: as set, and so that it can be described at all.
+    /// Maximum size of one shape's file: the configured one, reduced if the shape could not be
+    /// described.
     pub fn shape_bytes(&self) -> u64 {
         let describable = (self.describe_bytes() - DESCRIBE_BASE) / DESCRIBE_PER_BYTE;
         self.max_shape.0.min(describable)
@@ -448,7 +450,7 @@ pub fn library_directory(named: Option<&PathBuf>) -> Result<PathBuf, ConfigError
         })
 }
 
-/// Full names of the keys a source sets.
+/// Full names of the keys that a source sets.
 fn keys_of(source: &dyn Source, origin: &str) -> Result<BTreeSet<String>, ConfigError> {
     fn flatten(prefix: &str, value: &Value, keys: &mut BTreeSet<String>) {
         match &value.kind {
@@ -497,7 +499,7 @@ fn check_keys(
     })
 }
 
-/// `work.workers` as `COSEG__WORK__WORKERS`.
+/// The environment variable of a key: `COSEG__WORK__WORKERS` for `work.workers`.
 fn variable_name(key: &str) -> String {
     format!(
         "{ENV_PREFIX}{ENV_SEPARATOR}{}",

@@ -1,4 +1,4 @@
-//! A pointwise map becomes a statement about parts: which part of A matches which part of B.
+//! Matches the parts of shape A with those of shape B by a pointwise map.
 
 use crate::segmentation::Surface;
 
@@ -53,7 +53,7 @@ pub fn parts(surface: &Surface, labels: &[u32]) -> Parts {
     }
 }
 
-/// Part of each vertex: that of most of the area around it; ties go to the larger part.
+/// Part of each vertex: the part with most of the area around it; ties go to the larger part.
 pub fn part_of_vertex(
     parts: &Parts,
     n_vertices: usize,
@@ -79,9 +79,9 @@ pub fn part_of_vertex(
     around.into_iter().map(most).collect()
 }
 
-/// Intersection over union, by mass on shape B, of every part of B with every part of A carried over by
-/// `p2p (n_b,)`: for each vertex of B a vertex of A. Only pairs that overlap: (part of A, part of B, overlap),
-/// by descending overlap.
+/// Intersection over union, by mass on shape B, of every part of B with every part of A transferred
+/// by `p2p (n_b,)`: for each vertex of B a vertex of A. Returns pairs that overlap: (part of A,
+/// part of B, overlap), by descending overlap.
 pub fn overlaps(
     part_of_a: &[u32],
     part_of_b: &[u32],
@@ -138,7 +138,7 @@ mod tests {
 
     #[test]
     fn overlap_is_intersection_over_union() {
-        // Two parts on either side; one of four vertices is carried to the wrong one.
+        // Each shape has two parts; one of four vertices is mapped to the wrong one.
         let found = overlaps(&[0, 0, 1, 1], &[0, 0, 1, 1], &[0, 1, 1, 3], &[0.25; 4]);
         assert_eq!(found, vec![(0, 0, 2.0 / 3.0), (1, 1, 0.5), (0, 1, 0.25)]);
     }

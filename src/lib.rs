@@ -1,25 +1,27 @@
 //! Keeps a growing library of 3D shapes consistently segmented and labelled.
 //!
-//! Data flows one way. [`pipeline::describe`] turns the bytes of one mesh into a [`pipeline::Description`]
-//! (pure, parallel, depends on the shape alone). [`pipeline::label`] relates a description to a bounded
-//! number of known shapes and labels its faces (pure, serial per collection). [`Library`] commits the
-//! result: the one effect. The daemon is a shell around [`Library`].
+//! Data flows one way. [`pipeline::describe`] turns the bytes of one mesh into a
+//! [`pipeline::Description`] (pure, parallel, depends on the shape alone). [`pipeline::label`]
+//! relates a description to a bounded number of known shapes and labels its faces (pure, serial per
+//! collection). [`Library`] commits the result, which is the only effect. The daemon is a shell
+//! around [`Library`].
 
-// In the order in which data flows: a module names only modules before it (tests/it/tidy.rs).
+// Modules are in the order of the data flow: a module names only modules before it
+// (tests/it/tidy.rs).
 
-// Geometry: one or two meshes in, values out; a crate of its own.
+// Geometry, a crate of its own: computes values from one or two meshes.
 pub use coseg_geometry::{
     SpectralMesh, description, descriptors, fmap, linalg, mesh, operators, segmentation, spectrum,
 };
 
-// Pure: values in, values out.
+// Pure modules: values in, values out.
 pub mod correspondence;
 pub mod labels;
 pub mod neighbors;
 pub mod pipeline;
 pub mod synth;
 
-// Shell: files, sockets, clocks.
+// Shell: modules that use files, sockets and clocks.
 pub mod store;
 pub mod library;
 pub mod ipc;

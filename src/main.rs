@@ -7,8 +7,8 @@ mod telemetry;
 use clap::Parser as _;
 use std::process::ExitCode;
 
-/// Gives memory back in the background, seconds after a burst of work: after 397 shapes the idle daemon keeps 22 MB
-/// on the heap, where the system's allocator kept 360.
+/// Returns memory in the background, seconds after a burst of work: after 397 shapes the idle
+/// daemon keeps 22 MB on the heap, where the system's allocator kept 360.
 #[global_allocator]
 static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
 

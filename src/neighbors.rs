@@ -1,11 +1,12 @@
-//! Global descriptors become a ranking of the known shapes: which of them a new shape is compared with.
+//! Ranks the known shapes by their global descriptors, to select those that a new shape is compared
+//! with.
 
 use crate::labels::Normalisation;
 
 /// Quantiles count half as much as means.
 const QUANTILE_WEIGHT: f64 = 0.5;
 
-/// What makes signatures of a collection comparable: a scale for each column of the face descriptors.
+/// The metric for signatures of a collection: a scale for each column of the face descriptors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignatureMetric {
     scale: Vec<f64>,

@@ -1,4 +1,5 @@
-//! Log events become lines on stderr, for people or as JSON; the filter can be changed while running.
+//! Writes log events as lines to stderr, for people or as JSON; the filter can be changed while the
+//! program runs.
 
 use coseg::config::{Log, LogFormat};
 use std::io::IsTerminal as _;
@@ -13,18 +14,18 @@ pub(crate) struct Telemetry {
     filter: reload::Handle<EnvFilter, Registry>,
 }
 
-/// Why logging cannot be set up or changed.
+/// The reason why logging cannot be set up or changed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum TelemetryError {
-    /// The level is no level or filter.
+    /// The level is neither a level nor a filter.
     #[error("log.level {level:?}: {source}")]
     Level {
-        /// As configured.
+        /// The configured level.
         level: String,
-        /// What is wrong with it.
+        /// The parser's error.
         source: tracing_subscriber::filter::ParseError,
     },
-    /// There is a logger already, or none any more.
+    /// A logger exists already, or exists no more.
     #[error("logging: {0}")]
     Setup(String),
 }
@@ -55,7 +56,7 @@ pub(crate) fn start(log: &Log) -> Result<Telemetry, TelemetryError> {
 }
 
 impl Telemetry {
-    /// Takes over another level.
+    /// Changes the level.
     pub(crate) fn set_level(&self, level: &str) -> Result<(), TelemetryError> {
         let filter = filter(level)?;
         self.filter

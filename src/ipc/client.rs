@@ -1,4 +1,5 @@
-//! A blocking client: one request out, its reply back, the same request again when no answer came.
+//! A blocking client: sends one request, receives its reply, and repeats the request if no answer
+//! comes.
 
 use crate::ipc::endpoint::{Endpoint, EndpointError};
 use crate::ipc::frames::{self, FrameLimits};
@@ -8,20 +9,21 @@ use bytes::Bytes;
 use prost::Message as _;
 use std::time::{Duration, Instant};
 
-/// How long a client waits for an answer unless told otherwise.
+/// Default time limit for an answer.
 pub const DEFAULT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Tries within the timeout: the second one on a new connection, should the first have been lost.
+/// Number of tries within the timeout: the second one uses a new connection, in case the first was
+/// lost.
 const TRIES: u32 = 2;
-/// Milliseconds a socket that is closed goes on sending.
+/// Milliseconds for which a closed socket continues to send.
 const LINGER_MS: i32 = 0;
-/// What a client accepts of a reply; the daemon's own limits are on requests.
+/// The limits that a client sets on replies; the daemon's own limits are on requests.
 const REPLY_LIMITS: FrameLimits = FrameLimits {
     max_message_bytes: 4 << 30,
     max_frames: 1 << 20,
     max_header_bytes: 256 << 20,
 };
 
-/// Why a request has no result.
+/// The reason why a request has no result.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum ClientError {
@@ -51,7 +53,7 @@ pub enum ClientError {
 /// A reply's result and its raw frames.
 pub type Answer = (reply::Result, Vec<Bytes>);
 
-/// A connection to a daemon. Requests are answered one at a time.
+/// A connection to a daemon. It processes one request at a time.
 pub struct Client {
     context: zmq::Context,
     socket: zmq::Socket,
@@ -64,7 +66,7 @@ pub struct Client {
 }
 
 impl Client {
-    /// Connects to `uri`. That somebody listens there shows with the first request.
+    /// Connects to `uri`. A missing listener is noticed at the first request.
     pub fn connect(uri: &str, timeout: Duration) -> Result<Self, ClientError> {
         Self::connect_with(uri, timeout, None)
     }
@@ -78,7 +80,7 @@ impl Client {
         let endpoint = Endpoint::parse(uri)?;
         let context = zmq::Context::new();
         let socket = dealer(&context, &endpoint, keys.as_ref())?;
-        // Unique among all clients of all time: two runs must not share idempotency keys.
+        // Unique among all clients at all times: two runs must not share idempotency keys.
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let nanos = since.map_or(0, |d| d.as_nanos());
         let client_id = format!("rust-{}-{nanos:x}", std::process::id());
@@ -94,18 +96,18 @@ impl Client {
         })
     }
 
-    /// Takes another name than the unique one made up by [`Client::connect`], for callers that repeat
+    /// Sets another client id than the unique one of [`Client::connect`], for callers that repeat
     /// requests across processes.
     pub fn set_client_id(&mut self, client_id: impl Into<String>) {
         self.client_id = client_id.into();
     }
 
-    /// How long an answer is waited for.
+    /// The time limit for an answer.
     pub fn timeout(&self) -> Duration {
         self.timeout
     }
 
-    /// Where the daemon is.
+    /// The address of the daemon.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
@@ -117,7 +119,8 @@ impl Client {
         self.call_as(&request_id, body, frames)
     }
 
-    /// The same under a request id of the caller's choice: the same id again is the same request.
+    /// Like [`Client::call`], with a request id chosen by the caller: equal ids mean the same
+    /// request.
     pub fn call_as(
         &mut self,
         request_id: &str,
@@ -138,8 +141,9 @@ impl Client {
         let mut alive_as = None;
         let mut answer = self.exchange(&sent, request_id, until)?;
         while answer.is_none() {
-            // Lost, or still at it? Who answers a Hello on a new connection within the other half of the time is
-            // alive, and a daemon that is alive is waited for: a correction may wait while a lane learns.
+            // The request is either lost or still running. A daemon that answers a Hello on a new
+            // connection within the other half of the time is alive, and the client waits for it: a
+            // correction may wait while its collection is busy.
             let Some(instance) = self.instance()? else {
                 return Err(ClientError::NoAnswer {
                     endpoint: self.endpoint.to_string(),
@@ -150,7 +154,8 @@ impl Client {
             answer = if alive_as.as_ref() == Some(&instance) {
                 self.reply_to(request_id, until)?
             } else {
-                // The first time, or another daemon than before: the request may be lost. Changes have one effect.
+                // At the first repetition, or if the daemon has restarted, the request may be lost.
+                // Repeating it is safe, because changes have one effect.
                 self.socket = dealer(&self.context, &self.endpoint, self.keys.as_ref())?;
                 alive_as = Some(instance);
                 self.exchange(&sent, request_id, until)?
@@ -164,7 +169,8 @@ impl Client {
         }
     }
 
-    /// Which daemon answers, asked on a connection of its own; none within half of the timeout.
+    /// The instance of the daemon that answers, requested on a separate connection; `None` after
+    /// half of the timeout.
     fn instance(&self) -> Result<Option<String>, ClientError> {
         let request = Request {
             request_id: "alive".to_owned(),
@@ -186,14 +192,14 @@ impl Client {
         let answer = other.exchange(&[&header], &request.request_id, until)?;
         Ok(answer.and_then(|(reply, _)| match reply.result {
             Some(reply::Result::Hello(hello)) => Some(hello.instance),
-            // It lives, if it is only to refuse.
+            // The daemon is alive, even if it only refuses.
             Some(_) => Some(String::new()),
             None => None,
         }))
     }
 
-    /// The same, but a daemon that is at a limit is asked again after the delay it names, for as long
-    /// as it answers.
+    /// Like [`Client::call`], but repeats the request to a daemon that is at a limit after the
+    /// delay that it names, as long as it answers.
     pub fn call_patiently(
         &mut self,
         body: &request::Body,
@@ -213,7 +219,7 @@ impl Client {
         }
     }
 
-    /// Who the daemon is; asked once.
+    /// The daemon's description of itself; requested once.
     pub fn hello(&mut self) -> Result<&wire::HelloReply, ClientError> {
         if self.hello.is_none() {
             let body = request::Body::Hello(wire::HelloRequest {});
@@ -225,7 +231,7 @@ impl Client {
         Ok(self.hello.as_ref().expect("invariant: set above"))
     }
 
-    /// A socket that receives the events of `collection`, or of all, and heartbeats.
+    /// A socket that receives the events of `collection`, or of all collections, and heartbeats.
     pub fn subscribe(&mut self, collection: Option<&str>) -> Result<zmq::Socket, ClientError> {
         let endpoint = self.events()?;
         let socket_error = |source| ClientError::Socket {
@@ -249,7 +255,8 @@ impl Client {
         Ok(socket)
     }
 
-    /// Where events are: on the host that the client knows if the daemon listens on all of its own.
+    /// The address of events: on the host that the client knows, if the daemon listens on all its
+    /// addresses.
     fn events(&mut self) -> Result<String, ClientError> {
         let said = self.hello()?.event_endpoint.clone();
         match (Endpoint::parse(&said)?, &self.endpoint) {
@@ -287,8 +294,8 @@ impl Client {
         Ok(())
     }
 
-    /// Sends once and waits for the reply to `request_id` until `until`; replies to earlier requests
-    /// are dropped.
+    /// Sends once and waits for the reply to `request_id` until `until`; drops replies to earlier
+    /// requests.
     fn exchange(
         &self,
         parts: &[&[u8]],
@@ -307,7 +314,7 @@ impl Client {
         }
     }
 
-    /// Waits for the reply to `request_id` until `until`; replies to earlier requests are dropped.
+    /// Waits for the reply to `request_id` until `until`; drops replies to earlier requests.
     fn reply_to(
         &self,
         request_id: &str,
@@ -355,8 +362,8 @@ fn dealer(
     let connect = || {
         let socket = context.socket(zmq::DEALER)?;
         socket.set_linger(LINGER_MS)?;
-        // Not ZMQ_IMMEDIATE: with it, an answer that has arrived is thrown away if the daemon closes the
-        // connection before it is read, as it does after the last answer of a drain.
+        // ZMQ_IMMEDIATE is not set: with it, a reply that has arrived is lost if the daemon closes
+        // the connection before it is read, as it does after the last reply of a drain.
         let v6 = matches!(endpoint, Endpoint::Tcp { host, .. } if host.starts_with('['));
         socket.set_ipv6(v6)?;
         keys.map_or(Ok(()), |k| k.apply(&socket))?;
@@ -369,17 +376,17 @@ fn dealer(
     })
 }
 
-/// A reply whose result does not belong to the request.
+/// The error for a reply whose result does not belong to the request.
 pub fn unexpected(result: &reply::Result) -> ClientError {
     let text = format!("{result:?}");
     let name = text.split(['(', ' ']).next().unwrap_or_default();
     ClientError::BadReply(format!("an unexpected {name}"))
 }
 
-/// Calls, and takes the result of the variant named.
+/// Sends a request, and extracts the result of the named variant.
 ///
-/// `call!(client, Hello(HelloRequest {}))` is the `HelloReply`, and with `, frames` at the end the pair
-/// of the reply and its raw frames.
+/// `call!(client, Hello(HelloRequest {}))` is the `HelloReply`; with `, frames` at the end it is
+/// the pair of the reply and its raw frames.
 #[macro_export]
 macro_rules! call {
     ($client:expr, $variant:ident($body:expr)) => {

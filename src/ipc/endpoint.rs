@@ -1,4 +1,4 @@
-//! Endpoint URIs become checked addresses: where the daemon listens and where clients find it.
+//! Parses and checks endpoint URIs: the addresses where the daemon listens and clients connect.
 
 use super::folder::{DefaultFolder, private_directory};
 use rustix::fs::OFlags;
@@ -9,12 +9,13 @@ use std::net::IpAddr;
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
-/// Bytes of the path of a Unix socket, as the kernel's `sockaddr_un` has it, less the final NUL.
+/// Maximum length in bytes of the path of a Unix socket: the kernel's `sockaddr_un`, less the final
+/// NUL.
 pub const MAX_SOCKET_PATH_BYTES: usize = 107;
-/// What is appended to the request socket's path for the event socket.
+/// Suffix of the request socket's path that gives the event socket's path.
 const EVENTS_SUFFIX: &str = ".events";
 
-/// Why an endpoint cannot be used.
+/// The reason why an endpoint cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum EndpointError {
@@ -48,14 +49,14 @@ pub enum EndpointError {
     },
 }
 
-/// A place to listen at or to connect to.
+/// An address to listen at or to connect to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Endpoint {
-    /// A Unix socket.
+    /// Path of a Unix socket.
     Ipc(PathBuf),
-    /// A TCP port; 0 asks for any free one.
+    /// A TCP port; 0 selects any free one.
     Tcp {
-        /// Name or address, an IPv6 address in brackets.
+        /// Name or address; an IPv6 address is in brackets.
         host: String,
         /// Port.
         port: u16,
@@ -72,7 +73,7 @@ impl fmt::Display for Endpoint {
 }
 
 impl Endpoint {
-    /// Reads `ipc://PATH` (made absolute) or `tcp://HOST:PORT` (`*` as port: any free one).
+    /// Parses `ipc://PATH` (made absolute) or `tcp://HOST:PORT` (`*` as port: any free one).
     pub fn parse(uri: &str) -> Result<Self, EndpointError> {
         let malformed = |message: &str| EndpointError::Malformed {
             uri: uri.to_owned(),
@@ -94,7 +95,7 @@ impl Endpoint {
                 path: path.to_owned(),
                 source,
             })?;
-            // The event socket's path is the longer one.
+            // The path of the event socket is the longer one.
             let found = path.as_os_str().len() + EVENTS_SUFFIX.len();
             if found > MAX_SOCKET_PATH_BYTES {
                 return Err(EndpointError::PathTooLong {
@@ -128,23 +129,22 @@ impl Endpoint {
         })
     }
 
-    /// Where a daemon listens, and where clients look, when nobody says otherwise:
-    /// `$RUNTIME_DIRECTORY/coseg.sock` under a service manager, else
-    /// `$XDG_RUNTIME_DIR/coseg/coseg.sock`, else `/tmp/coseg-UID/coseg.sock`.
+    /// The default endpoint of daemons and clients: `$RUNTIME_DIRECTORY/coseg.sock` under a service
+    /// manager, else `$XDG_RUNTIME_DIR/coseg/coseg.sock`, else `/tmp/coseg-UID/coseg.sock`.
     pub fn default_for_user() -> Self {
         Self::Ipc(DefaultFolder::of_this_process().path().join("coseg.sock"))
     }
 
-    /// The same for a client, which must not talk to whoever made that folder first: it belongs to
-    /// this user or to root, and nobody else may enter it; the folder of a service may let a group
-    /// in.
+    /// The default endpoint for a client, which must not connect to a folder that another user
+    /// created first. The folder must belong to this user or to root and be closed to others; the
+    /// folder of a service may let a group in.
     pub fn default_for_client() -> Result<Self, EndpointError> {
         DefaultFolder::of_this_process().check()?;
         Ok(Self::default_for_user())
     }
 
-    /// Where events are published beside this endpoint: the path with `.events`, or the next port
-    /// (any free one if this port is 0).
+    /// The address of the events of this endpoint: the path with `.events`, or the next port (any
+    /// free one if this port is 0).
     pub fn events(&self) -> Result<Self, EndpointError> {
         match self {
             Self::Ipc(path) => {
@@ -171,8 +171,8 @@ impl Endpoint {
         }
     }
 
-    /// Refuses what a daemon must not listen at: anything beyond this machine, unless every connection is
-    /// encrypted and authenticated.
+    /// Rejects addresses at which a daemon must not listen: those beyond this machine, unless every
+    /// connection is encrypted and authenticated.
     pub fn check_servable(&self, has_keys: bool) -> Result<(), EndpointError> {
         let Self::Tcp { host, .. } = self else {
             return Ok(());
@@ -190,8 +190,8 @@ impl Endpoint {
     }
 }
 
-/// Makes ready to bind a Unix socket at `path`: a private directory, no live daemon, no stale socket.
-/// The returned lock keeps other daemons away for as long as it is held.
+/// Prepares to bind a Unix socket at `path`: checks for a private directory and for a live daemon,
+/// and removes a stale socket. The returned lock excludes other daemons as long as it is held.
 pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
     let io = |path: &Path| {
         let path = path.display().to_string();
@@ -206,7 +206,7 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
         .create(true)
         .truncate(false)
         .write(true)
-        // In a folder for everybody somebody else may have put a link or a pipe there.
+        // In a folder that others may write to, somebody may have placed a link or a pipe.
         .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed())
         .open(&lock_path)
         .map_err(io(&lock_path))?;
@@ -229,7 +229,7 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
                     path: path.display().to_string(),
                 });
             }
-            // Somebody who does not take the lock may listen there.
+            // A process that ignores the lock may listen there.
             if std::os::unix::net::UnixStream::connect(path).is_ok() {
                 return Err(in_use());
             }
@@ -240,8 +240,9 @@ pub fn claim_socket(path: &Path) -> Result<fs::File, EndpointError> {
     Ok(lock)
 }
 
-/// Writes this process's id for whoever finds the lock taken; what a daemon that ended has left there
-/// is never read. Not to a file that somebody else has put there: a folder may be open to others.
+/// Writes this process's id for a daemon that finds the lock taken; the id of a daemon that has
+/// ended is never read. It does not write to a file that somebody else created, since the folder
+/// may be open to others.
 fn tell_holder(mut lock: &fs::File) -> std::io::Result<()> {
     let found = lock.metadata()?;
     let is_ours = found.uid() == rustix::process::getuid().as_raw() && found.nlink() == 1;

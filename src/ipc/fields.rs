@@ -1,23 +1,24 @@
 //! Counts the fields of an encoded message before it is decoded.
 //!
-//! A field of two bytes can become hundreds when it is decoded: an empty message in a list, for
-//! instance. What a header may become is therefore bounded by its fields as well as by its bytes.
+//! Decoding can turn a field of two bytes into hundreds, for example an empty message in a list.
+//! Therefore a limit on fields bounds the memory of a header, in addition to the limit on its
+//! bytes.
 
-/// Fields of a header. The longest lists that a request may have stay far below.
+/// Maximum number of fields of a header. The longest lists that a request may have stay far below.
 pub const MAX_FIELDS: usize = 100_000;
 
-/// Levels of messages within messages that are looked into; no field of a request is deeper.
+/// Depth to which nested messages are examined; no field of a request is deeper.
 const MAX_DEPTH: u32 = 6;
 
-/// Fields of an encoded message, with those of the messages within it; more than `limit` are not
-/// counted further. Text and bytes that could be a message count as one: there is no schema here.
+/// Number of fields of an encoded message, including nested messages; counting stops beyond
+/// `limit`. Text and bytes that could be a message count as one, since no schema is known here.
 pub fn count(message: &[u8], limit: usize) -> usize {
     let mut n = 0;
     walk(message, MAX_DEPTH, limit, &mut n);
     n
 }
 
-/// Adds the fields of `message` to `n`. Whether all of it is fields.
+/// Adds the fields of `message` to `n`. Returns whether it consists of fields only.
 fn walk(mut message: &[u8], depth: u32, limit: usize, n: &mut usize) -> bool {
     while !message.is_empty() {
         if *n > limit {
@@ -59,7 +60,7 @@ fn walk(mut message: &[u8], depth: u32, limit: usize, n: &mut usize) -> bool {
     true
 }
 
-/// The variable-length integer that bytes begin with, which is taken from them.
+/// Reads the variable-length integer at the beginning of bytes, and removes it.
 fn varint(bytes: &mut &[u8]) -> Option<u64> {
     let mut value = 0;
     for shift in (0..64).step_by(7) {
@@ -96,7 +97,7 @@ mod tests {
 
     #[test]
     fn fields_of_messages_within_messages_count() {
-        // The id, the body, the collection; then each shape.
+        // The fields are the id, the body, the collection, and then each shape.
         assert_eq!(count(&addition(0), MAX_FIELDS), 3);
         assert_eq!(count(&addition(40), MAX_FIELDS), 43);
         assert!(count(&addition(2 * MAX_FIELDS), MAX_FIELDS) > MAX_FIELDS);
@@ -113,7 +114,7 @@ mod tests {
         ] {
             assert!(count(bytes, MAX_FIELDS) <= 1, "{bytes:?}");
         }
-        // Messages in messages without end are not followed without end.
+        // Endless nesting is followed to a limited depth only.
         let mut deep = Vec::new();
         for _ in 0..10_000 {
             let length = deep.len();

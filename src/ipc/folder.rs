@@ -1,4 +1,5 @@
-//! The folder of a socket: who can put a socket there decides who answers at its path.
+//! Checks the folder of a socket: users who can create a socket there decide who answers at its
+//! path.
 
 use super::endpoint::EndpointError;
 use rustix::process::getuid;
@@ -7,12 +8,12 @@ use std::io::ErrorKind;
 use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
 
-/// The folder in which daemon and clients meet when nobody names an endpoint.
+/// The folder in which daemon and clients meet if no endpoint is named.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum DefaultFolder {
-    /// Of the service manager, which may let a group in.
+    /// The folder of the service manager, which may let a group in.
     Service(PathBuf),
-    /// Of one user, below a folder that is there already.
+    /// The folder of one user, below an existing folder.
     User(PathBuf),
 }
 
@@ -37,8 +38,8 @@ impl DefaultFolder {
         }
     }
 
-    /// Refuses the folder if anybody but this user and root could listen there. One below `/tmp`
-    /// that is missing is made, so that nobody else makes it while a client waits for a daemon.
+    /// Rejects the folder if anybody but this user and root could listen there. Creates a missing
+    /// one below `/tmp`, so that nobody else creates it while a client waits for a daemon.
     pub(super) fn check(&self) -> Result<(), EndpointError> {
         let (path, forbidden) = match self {
             Self::Service(path) => (path, 0o022),
@@ -50,7 +51,7 @@ impl DefaultFolder {
                 _ => {}
             }
         }
-        // A link is judged as well as what it leads to: who can change it can lead elsewhere.
+        // Both a link and its target are checked: a user who can change the link can redirect it.
         for look in [fs::symlink_metadata, |p: &PathBuf| fs::metadata(p)] {
             match look(path) {
                 Ok(found) => self.judge(&found, forbidden)?,
@@ -104,7 +105,7 @@ fn io(path: &Path) -> impl Fn(std::io::Error) -> EndpointError {
     }
 }
 
-/// Creates `directory` for its owner alone, or checks that no other user can put files there.
+/// Creates `directory` for its owner alone, or checks that no other user can create files there.
 pub(super) fn private_directory(directory: &Path) -> Result<(), EndpointError> {
     DirBuilder::new()
         .mode(0o700)
@@ -127,7 +128,7 @@ pub(super) fn private_directory(directory: &Path) -> Result<(), EndpointError> {
     if metadata.uid() != uid && !(metadata.uid() == 0 && (sticky || mode & 0o022 == 0)) {
         return refuse(format!("belongs to user {}, not to {uid}", metadata.uid()));
     }
-    // The predictable name below /tmp could have been prepared by anybody.
+    // Anybody could have created the predictable name below /tmp.
     let well_known = directory.parent() == Some(Path::new("/tmp"))
         && directory
             .file_name()
@@ -157,7 +158,7 @@ mod tests {
         let path = directory.path().join("coseg");
         let user = DefaultFolder::User(path.clone());
         let service = DefaultFolder::Service(path.clone());
-        // Nobody listens there, and nobody else can make it.
+        // No daemon listens there, and nobody else can create it.
         user.check().unwrap();
         fs::create_dir(&path).unwrap();
         for (mode, for_user, for_service) in [
@@ -179,7 +180,7 @@ mod tests {
                 }
             }
         }
-        // What a link leads to counts.
+        // The target of a link is checked.
         let link = directory.path().join("link");
         std::os::unix::fs::symlink(&path, &link).unwrap();
         let linked = DefaultFolder::User(link);
@@ -194,7 +195,7 @@ mod tests {
         let path = directory.path().join("coseg");
         fs::create_dir(&path).unwrap();
         fs::set_permissions(&path, Permissions::from_mode(0o700)).unwrap();
-        // Only root can give a folder away.
+        // Only root can change the owner of a folder.
         if std::os::unix::fs::chown(&path, Some(12_345), None).is_err() {
             return;
         }

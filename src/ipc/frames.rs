@@ -1,23 +1,24 @@
-//! Multipart messages become a header and raw frames; array references become slices of frames.
+//! Splits multipart messages into a header and raw frames, and resolves array references to slices
+//! of frames.
 //!
-//! Counts and lengths are compared with the limits and with the bytes that are there before anything
-//! is reserved for them.
+//! Counts and lengths are compared with the limits and with the number of received bytes before
+//! memory is reserved for them.
 
 use crate::ipc::wire::{ArrayRef, BytesRef, DataType, ErrorReason};
 use bytes::Bytes;
 
-/// What one message may have; see `Limits` in `proto/coseg/v1/daemon.proto`.
+/// The limits of one message; see `Limits` in `proto/coseg/v1/daemon.proto`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameLimits {
-    /// Bytes of all frames together.
+    /// Maximum size of all frames together.
     pub max_message_bytes: u64,
-    /// Raw frames after the header.
+    /// Maximum number of raw frames after the header.
     pub max_frames: usize,
-    /// Bytes of the header frame.
+    /// Maximum size of the header frame.
     pub max_header_bytes: u64,
 }
 
-/// Why a message, or an array of it, cannot be used.
+/// The reason why a message, or an array in it, cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum FrameError {
@@ -73,7 +74,7 @@ impl FrameError {
         }
     }
 
-    /// The field it is about.
+    /// The field that the error concerns.
     pub fn field(&self) -> Option<&str> {
         match self {
             Self::TooLarge { .. } | Self::NoHeader => None,
@@ -87,7 +88,7 @@ impl FrameError {
     }
 }
 
-/// That a message has too much of what there are `found`.
+/// The message that `what` has `found` items, more than `limit`.
 pub(super) fn too_large(what: &str, found: u64, limit: u64) -> String {
     match what {
         "bytes" => super::size::beyond("the message", found, limit, "limits.max_message"),
@@ -95,10 +96,10 @@ pub(super) fn too_large(what: &str, found: u64, limit: u64) -> String {
     }
 }
 
-/// A message's frames; or, if it was too large, its first frames and why it was dropped.
+/// A message's frames; or, if it was too large, its first frames and the reason for dropping it.
 pub type Received = Result<Vec<Bytes>, (Vec<Bytes>, FrameError)>;
 
-/// A received frame that owns ZeroMQ's memory, so that it need not be copied.
+/// A received frame that owns ZeroMQ's memory, so that it is not copied.
 struct OwnedFrame(zmq::Message);
 
 impl AsRef<[u8]> for OwnedFrame {
@@ -107,8 +108,9 @@ impl AsRef<[u8]> for OwnedFrame {
     }
 }
 
-/// Receives all frames of one message. The outer error is the socket's; the inner one says that the
-/// message was too large and was dropped, with its first frames (at most `n_kept`) for an answer.
+/// Receives all frames of one message. The outer error is the socket's; the inner one means that
+/// the message was too large and was dropped, and contains its first frames (at most `n_kept`) for
+/// an answer.
 pub fn receive(
     socket: &zmq::Socket,
     flags: i32,
@@ -118,7 +120,7 @@ pub fn receive(
     receive_from(socket, flags, limits, n_kept).map(|(_, received)| received)
 }
 
-/// The same, with who sent it, if the connection is authenticated.
+/// Like [`receive`], and also returns the sender if the connection is authenticated.
 pub fn receive_from(
     socket: &zmq::Socket,
     flags: i32,
@@ -133,7 +135,8 @@ pub fn receive_from(
     let max_parts = limits.max_frames.saturating_add(n_kept);
     loop {
         let mut part = socket.recv_msg(if n_frames == 0 { flags } else { 0 })?;
-        // Of the last frame: every one has it but, on some sockets, the routing frame.
+        // The id is taken from the last frame: every frame has it except, on some sockets, the
+        // routing frame.
         user = part.gets("User-Id").map(str::to_owned).or(user);
         let more = part.get_more();
         n_frames += 1;
@@ -164,7 +167,7 @@ pub fn receive_from(
     }
 }
 
-/// Sends all frames as one message. With `flags` [`zmq::DONTWAIT`] either all of it is taken or none.
+/// Sends all frames as one message. With `flags` [`zmq::DONTWAIT`] either all or none are sent.
 pub fn send(socket: &zmq::Socket, parts: Vec<zmq::Message>, flags: i32) -> Result<(), zmq::Error> {
     let last = parts.len().saturating_sub(1);
     for (i, part) in parts.into_iter().enumerate() {
@@ -180,7 +183,7 @@ pub fn send(socket: &zmq::Socket, parts: Vec<zmq::Message>, flags: i32) -> Resul
     Ok(())
 }
 
-/// Collects the raw frames of a message that is being made.
+/// Collects the raw frames of a new message.
 #[derive(Debug, Default)]
 pub struct FrameWriter {
     frames: Vec<Bytes>,
@@ -270,7 +273,7 @@ macro_rules! array_reader {
 }
 
 impl<'a> FrameReader<'a> {
-    /// Over the raw frames, without the header.
+    /// Reads the raw frames, without the header.
     pub fn new(frames: &'a [Bytes]) -> Self {
         Self { frames }
     }
@@ -279,7 +282,7 @@ impl<'a> FrameReader<'a> {
     array_reader!(u32_array, u32, DataType::Uint32, "uint32");
     array_reader!(f32_array, f32, DataType::Float32, "float32");
     array_reader!(f64_array, f64, DataType::Float64, "float64");
-    // Indices: a negative one becomes larger than any count, so the range check finds it.
+    // A negative index becomes larger than any count, so the range check finds it.
     array_reader!(
         index_array,
         u32,

@@ -1,4 +1,4 @@
-//! What the daemon says, as JSON.
+//! Formats the daemon's replies as JSON.
 
 use crate::ipc::wire::{self, event::Kind};
 use serde_json::{Map, Value, json};
@@ -10,7 +10,7 @@ fn short(name: &str, prefix: &str) -> String {
         .to_ascii_lowercase()
 }
 
-/// An up axis, as it is typed.
+/// The name of an up axis on the command line.
 pub fn up(up: wire::Up) -> &'static str {
     match up {
         wire::Up::PlusX => "+x",
@@ -24,7 +24,7 @@ pub fn up(up: wire::Up) -> &'static str {
     }
 }
 
-/// What became of an added shape.
+/// The outcome of an added shape.
 pub fn outcome(outcome: wire::Outcome) -> String {
     short(outcome.as_str_name(), "OUTCOME_")
 }
@@ -34,7 +34,7 @@ pub fn colour(rgb: u32) -> String {
     format!("#{:06x}", rgb & 0xff_ffff)
 }
 
-/// An estimate of which way is up.
+/// An estimate of the up axis.
 pub fn up_estimate(e: &wire::UpEstimate) -> Value {
     json!({ "up": up(e.up()), "agreement": e.agreement })
 }
@@ -119,7 +119,7 @@ fn report(r: &wire::CleanReport) -> Value {
     })
 }
 
-/// One shape of a job; times in milliseconds by stage.
+/// One shape of a job; times are in milliseconds for each stage.
 pub fn job_item(i: &wire::JobItem) -> Value {
     let mut value =
         json!({ "name": i.name, "outcome": short(i.state().as_str_name(), "ITEM_STATE_") });
@@ -148,7 +148,7 @@ pub fn error(e: &wire::Error) -> Value {
     })
 }
 
-/// How good a functional map is.
+/// The quality of a functional map.
 pub fn quality(q: &wire::MapQuality) -> Value {
     json!({
         "descriptor_residual": q.descriptor_residual,
@@ -165,7 +165,7 @@ pub fn quality(q: &wire::MapQuality) -> Value {
     })
 }
 
-/// How a map agrees with the others of its collection.
+/// The agreement of a map with the others of its collection.
 pub fn agreement(a: &wire::MapAgreement) -> Value {
     json!({
         "n_triangles": a.n_triangles,
@@ -185,7 +185,7 @@ pub fn part_match(m: &wire::PartMatch) -> Value {
     })
 }
 
-/// An event, flat: `kind` and what belongs to it beside sequence and collection.
+/// An event as a flat object: `kind` and its data beside sequence and collection.
 pub fn event(e: &wire::Event) -> Value {
     let (kind, body) = match &e.kind {
         None => ("unknown", json!({})),

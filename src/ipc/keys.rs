@@ -1,8 +1,9 @@
-//! Key files and the allow list: who may connect over CURVE, and what each may ask.
+//! Reads and writes key files and the allow list, which names the clients that may connect over
+//! CURVE and their roles.
 //!
-//! A folder of keys has `server.key` (secret, for its owner alone), `server.pub` (for clients) and `allow`,
-//! a line for each client: role, public key, name. Keys are Curve25519, written in Z85 (ZeroMQ RFC 32),
-//! 40 characters.
+//! A folder of keys has `server.key` (secret, for its owner alone), `server.pub` (for clients) and
+//! `allow`, with one line for each client: role, public key, name. Keys are Curve25519, written in
+//! Z85 (ZeroMQ RFC 32), 40 characters.
 
 use std::fmt;
 use std::io::{Read as _, Write as _};
@@ -14,14 +15,14 @@ use std::str::FromStr;
 pub const SERVER_KEY_FILE: &str = "server.key";
 /// The daemon's public key, which clients need.
 pub const SERVER_PUBLIC_FILE: &str = "server.pub";
-/// Who may connect.
+/// The list of clients that may connect.
 pub const ALLOW_FILE: &str = "allow";
-/// Bytes that a key file or an allow list may have.
+/// Maximum size of a key file or an allow list in bytes.
 const MAX_FILE_BYTES: u64 = 4 << 20;
-/// Characters of a client's name.
+/// Maximum length of a client's name in characters.
 const MAX_NAME_CHARS: usize = 128;
 
-/// Why keys cannot be used.
+/// The reason why keys cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum KeyError {
@@ -54,7 +55,7 @@ pub enum KeyError {
     Generate(zmq::Error),
 }
 
-/// What a client may ask; each role may do what those before it may.
+/// The permissions of a client; each role includes those before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
     /// Read shapes, labels, arrays and events.
@@ -96,7 +97,7 @@ impl FromStr for Role {
 pub struct PublicKey(String);
 
 impl PublicKey {
-    /// From the 32 bytes that ZeroMQ hands over.
+    /// Parses the 32 bytes that ZeroMQ provides.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         (bytes.len() == 32)
             .then(|| zmq::z85_encode(bytes).ok())
@@ -104,7 +105,7 @@ impl PublicKey {
             .map(Self)
     }
 
-    /// 40 characters.
+    /// The 40 characters of the key.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -142,7 +143,7 @@ pub struct KeyPair {
 
 impl fmt::Debug for KeyPair {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // The secret must not get into a log.
+        // The secret key must not appear in a log.
         write!(f, "KeyPair({})", self.public)
     }
 }
@@ -206,17 +207,17 @@ pub fn read_public(path: &Path) -> Result<PublicKey, KeyError> {
         .parse()
 }
 
-/// What a client needs to connect to a daemon with keys.
+/// The keys with which a client connects to a daemon with keys.
 #[derive(Debug, Clone)]
 pub struct ClientKeys {
-    /// The daemon's public key: whoever else answers is not talked to.
+    /// The daemon's public key; the connection fails if another daemon answers.
     pub server: PublicKey,
     /// The client's own keys.
     pub own: KeyPair,
 }
 
 impl ClientKeys {
-    /// Makes the connections of a socket encrypted and authenticated.
+    /// Makes the connections of a client socket encrypted and authenticated.
     pub fn apply(&self, socket: &zmq::Socket) -> Result<(), zmq::Error> {
         socket.set_curve_serverkey(&self.server.bytes())?;
         socket.set_curve_publickey(&self.own.public.bytes())?;
@@ -225,7 +226,7 @@ impl ClientKeys {
 }
 
 impl KeyPair {
-    /// Makes a socket that listens take encrypted and authenticated connections only.
+    /// Makes a listening socket accept only encrypted and authenticated connections.
     pub fn serve(&self, socket: &zmq::Socket) -> Result<(), zmq::Error> {
         socket.set_zap_domain("coseg")?;
         socket.set_curve_server(true)?;
@@ -236,22 +237,22 @@ impl KeyPair {
 /// A client that may connect.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Allowed {
-    /// What it may ask.
+    /// Its role.
     pub role: Role,
-    /// Who it is.
+    /// Its public key.
     pub key: PublicKey,
-    /// What people call it.
+    /// Its name for people.
     pub name: String,
 }
 
-/// Who may connect.
+/// The clients that may connect.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct AllowList {
     clients: Vec<Allowed>,
 }
 
 impl AllowList {
-    /// Reads the list; nobody may connect where there is none.
+    /// Reads the list; a missing list is empty.
     pub fn read(path: &Path) -> Result<Self, KeyError> {
         match read_text(path) {
             Ok(text) => Self::parse(&text, path),
@@ -265,7 +266,7 @@ impl AllowList {
     fn parse(text: &str, path: &Path) -> Result<Self, KeyError> {
         let mut list = Self::default();
         for (i, line) in text.lines().enumerate() {
-            // Only at the beginning of a line: keys may have a `#`.
+            // A comment starts at the beginning of a line only, since keys may contain `#`.
             if line.trim().is_empty() || line.starts_with('#') {
                 continue;
             }
@@ -291,7 +292,7 @@ impl AllowList {
         Ok(list)
     }
 
-    /// Writes the list in the place of the old one, at once.
+    /// Replaces the list atomically.
     pub fn write(&self, path: &Path) -> Result<(), KeyError> {
         let mut text =
             String::from("# Who may connect: role (read-only, ingest, admin), key, name\n");
@@ -305,7 +306,7 @@ impl AllowList {
         std::fs::rename(&new, path).map_err(io(path))
     }
 
-    /// Those who may connect.
+    /// The clients that may connect.
     pub fn clients(&self) -> &[Allowed] {
         &self.clients
     }
@@ -315,7 +316,7 @@ impl AllowList {
         self.clients.iter().find(|c| c.key.as_str() == key)
     }
 
-    /// Lets a client in; name and key must be new.
+    /// Adds a client; its name and key must be new.
     pub fn add(&mut self, client: Allowed) -> Result<(), KeyError> {
         check_name(&client.name)?;
         let other = self
@@ -335,7 +336,7 @@ impl AllowList {
         Ok(())
     }
 
-    /// Takes a client off the list, by name or key.
+    /// Removes a client from the list, by name or key.
     pub fn remove(&mut self, who: &str) -> Result<Allowed, KeyError> {
         let at = self
             .clients
@@ -348,7 +349,7 @@ impl AllowList {
     }
 }
 
-/// Refuses names that could not stand in the list, or be a file's.
+/// Rejects names that cannot be written in the list or used as a file name.
 pub fn check_name(name: &str) -> Result<(), KeyError> {
     let fits = |c: char| c.is_alphanumeric() || "._-@".contains(c);
     let n = name.chars().count();

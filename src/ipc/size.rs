@@ -1,4 +1,4 @@
-//! Numbers of bytes as messages tell them.
+//! Formats numbers of bytes for messages.
 
 const UNITS: [(&str, u64); 4] = [
     ("TiB", 1 << 40),
@@ -7,8 +7,8 @@ const UNITS: [(&str, u64); 4] = [
     ("KiB", 1 << 10),
 ];
 
-/// `64 MiB` where it is just that, `76.3 MiB (80000000 bytes)` where it is rounded, `999 bytes`
-/// below a KiB.
+/// Formats a size: `64 MiB` if that is exact, `76.3 MiB (80000000 bytes)` if it is rounded, `999
+/// bytes` below a KiB.
 pub fn in_words(n: u64) -> String {
     match UNITS.iter().find(|(_, unit)| n >= *unit) {
         None if n == 1 => "1 byte".to_owned(),
@@ -18,7 +18,7 @@ pub fn in_words(n: u64) -> String {
     }
 }
 
-/// That something is larger than a limit, and which setting of the daemon raises that.
+/// The message that something exceeds a limit, with the setting of the daemon that raises it.
 pub fn beyond(what: &str, found: u64, limit: u64, key: &str) -> String {
     let (found, limit) = (in_words(found), in_words(limit));
     format!("{what} has {found}, the limit is {limit} ({key} of the daemon's configuration)")

@@ -1,11 +1,11 @@
-//! The kept maps of a collection, and which of them do not agree with the others.
+//! Reads the stored maps of a collection, and finds maps that disagree with the others.
 
 use super::catalog::Reader;
 use super::error::StoreError;
 use super::rows::{CollectionId, ShapeId};
 use crate::fmap::consistency::{Link, Numbered, Standing, leading, links, standings};
 
-/// Rows and columns by which maps are compared; maps are less alike the finer they are.
+/// Rows and columns by which maps are compared; finer maps agree less.
 const K_COMPARED: u32 = 20;
 
 /// The leading blocks of the maps of one collection.
@@ -20,10 +20,10 @@ pub struct KeptMaps {
 }
 
 impl KeptMaps {
-    /// Reads them. Maps smaller than usual are left out.
+    /// Reads the maps of a collection. Maps smaller than usual are omitted.
     ///
     /// # Errors
-    /// A row is damaged, or the catalog cannot be read.
+    /// If a row is damaged, or the catalog cannot be read.
     pub fn read(reader: &Reader<'_>, collection: CollectionId) -> Result<Self, StoreError> {
         let rows = reader.shapes(collection, 0, usize::MAX, None)?;
         let mut kept = Self::none(rows.into_iter().map(|row| row.id).collect());
@@ -37,10 +37,10 @@ impl KeptMaps {
         Ok(kept)
     }
 
-    /// Reads those between a few shapes.
+    /// Reads the maps between a few shapes.
     ///
     /// # Errors
-    /// As [`KeptMaps::read`].
+    /// Like [`KeptMaps::read`].
     pub fn among(reader: &Reader<'_>, shapes: Vec<ShapeId>) -> Result<Self, StoreError> {
         let mut kept = Self::none(shapes);
         let ids = kept.shapes.clone();
@@ -72,8 +72,8 @@ impl KeptMaps {
         is_large
     }
 
-    /// How a map with `k1` columns between two of the shapes agrees with those that are kept, in the place of one between
-    /// them; `None` if it is too small.
+    /// The agreement of a map with `k1` columns between two of the shapes with the stored ones, of
+    /// which it replaces the one between these shapes; `None` if it is too small.
     pub fn standing_of(
         mut self,
         from: ShapeId,
@@ -88,8 +88,8 @@ impl KeptMaps {
         is_large.then(|| self.standings().pop()).flatten()
     }
 
-    /// How maps from some of the shapes to a further one agree with those that are kept: their coefficients, and columns.
-    /// Too small ones are left out.
+    /// The agreement of maps from some of the shapes to a new one with the stored ones, given their
+    /// coefficients and numbers of columns. Maps that are too small are omitted.
     pub fn standings_of_new(
         mut self,
         maps: &[(ShapeId, &[f32], usize)],
@@ -113,7 +113,7 @@ impl KeptMaps {
         links(&self.maps)
     }
 
-    /// How each of them agrees with the others.
+    /// The agreement of each of the maps with the others.
     pub fn standings(&self) -> Vec<Standing> {
         standings(&vec![self.k; self.shapes.len()], &self.links())
     }
@@ -124,7 +124,7 @@ mod tests {
     use super::{K_COMPARED, KeptMaps};
     use crate::store::rows::ShapeId;
 
-    /// Signs of a diagonal: right maps between shapes are 1 everywhere.
+    /// A diagonal map with these signs; right maps between these shapes are 1 everywhere.
     fn diagonal(sign: impl Fn(usize) -> f32, k1: usize) -> Vec<f32> {
         let mut c_12 = vec![0.0; K_COMPARED as usize * k1];
         for i in 0..K_COMPARED as usize {
@@ -157,7 +157,7 @@ mod tests {
         let found: Vec<_> = found.iter().map(|(id, s)| (*id, s.inconsistent)).collect();
         let told = [(0, false), (1, false), (2, false), (3, true)];
         assert_eq!(found, told.map(|(at, wrong)| (shapes[at], wrong)));
-        // The same in the place of a kept one.
+        // The same map in place of a stored one.
         let (from, to) = (shapes[1], shapes[0]);
         let standing = |c_12: &[f32]| kept.clone().standing_of(from, to, c_12, 20).unwrap();
         assert!(standing(&wrong).inconsistent && !standing(&right).inconsistent);

@@ -1,10 +1,11 @@
-//! A description becomes the bytes of a safetensors file, and a file's header the places of its arrays.
+//! Writes a description as a safetensors file, and reads the positions of arrays from a file's
+//! header.
 //!
-//! The format is safetensors (eight bytes of header length, a JSON header, the data), so that Python
-//! reads it without our code. Two things are added. The header is padded with spaces until the data
-//! begins at a multiple of 64 bytes, and the only 8-byte array comes first, so that every array can
-//! be used where it is mapped. Everything that is not an array (area, report, parameters, format
-//! version) stands in `__metadata__` as text. docs/format.md has the whole.
+//! The format is safetensors (eight bytes of header length, a JSON header, the data), so that
+//! Python reads it without our code. Two things are added. The header is padded with spaces until
+//! the data begin at a multiple of 64 bytes, and the only 8-byte array comes first, so that every
+//! array can be used where it is mapped. Everything that is not an array (area, report, parameters,
+//! format version) is text in `__metadata__`. docs/format.md describes the format completely.
 
 use crate::mesh::CleanReport;
 use crate::pipeline::{Description, DescriptionView};
@@ -13,13 +14,13 @@ use safetensors::tensor::Dtype;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Version of the array files; files of other versions are refused.
+/// Version of the array files; files of other versions are rejected.
 pub const ARRAY_FORMAT: u32 = 1;
 
 /// The data begins at a multiple of this: a cache line, and the widest vector register.
 pub(super) const DATA_ALIGNMENT: usize = 64;
 
-/// Why a description could not be written, or an array file is not what it should be.
+/// The reason why a description could not be written, or an array file is invalid.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages say it
 pub enum ArrayFileError {
@@ -75,7 +76,7 @@ pub enum ArrayFileError {
     },
 }
 
-/// One array of a description: its name, element type and shape, and where its bytes are.
+/// One array of a description: its name, element type, shape and bytes.
 #[derive(Debug)]
 struct Array<'a> {
     name: &'static str,
@@ -84,8 +85,8 @@ struct Array<'a> {
     bytes: &'a [u8],
 }
 
-/// An array file in pieces, to be written one after the other: the header, and the arrays where they are
-/// in the description, of which no second copy is made.
+/// An array file in pieces, to be written one after the other: the header, and the arrays of the
+/// description, which are not copied.
 #[derive(Debug)]
 pub struct DescriptionFile<'a> {
     header: Vec<u8>,
@@ -95,8 +96,8 @@ pub struct DescriptionFile<'a> {
 impl<'a> DescriptionFile<'a> {
     /// The file of a description. The same description and parameters give the same bytes.
     ///
-    /// `params_json` is kept as it is, for people and for recomputing. A description whose arrays do
-    /// not fit each other is refused with the array's name.
+    /// `params_json` is stored unchanged, for people and for recomputing. If the arrays of the
+    /// description do not fit each other, the error names the array.
     pub fn new(description: &'a Description, params_json: &str) -> Result<Self, ArrayFileError> {
         let view = description.view();
         let arrays = arrays(&view)?;
@@ -113,7 +114,7 @@ impl<'a> DescriptionFile<'a> {
         Ok(Self { header, arrays })
     }
 
-    /// What the file consists of.
+    /// The pieces of the file.
     pub fn pieces(&self) -> Vec<&[u8]> {
         let arrays = self.arrays.iter().map(|a| a.bytes);
         std::iter::once(self.header.as_slice())
@@ -122,7 +123,7 @@ impl<'a> DescriptionFile<'a> {
     }
 }
 
-/// The file's bytes for a description: those of [`DescriptionFile`] in one piece.
+/// The bytes of the file of a description, in one piece.
 pub fn write_description(
     description: &Description,
     params_json: &str,
@@ -132,8 +133,8 @@ pub fn write_description(
         .concat())
 }
 
-/// The header of a safetensors file whose arrays follow each other: its length, JSON, and spaces up to
-/// where the data begins.
+/// The header of a safetensors file with consecutive arrays: its length, JSON, and spaces up to the
+/// beginning of the data.
 pub(super) fn header<'a>(
     metadata: Option<serde_json::Map<String, serde_json::Value>>,
     arrays: impl Iterator<Item = (&'a str, Dtype, &'a [usize])>,
@@ -230,7 +231,7 @@ fn array<'a, T: bytemuck::NoUninit>(
     })
 }
 
-/// Indices are checked when a file is written and when it is opened, so that whoever holds a
+/// Indices are checked when a file is written and when it is opened, so that holders of a
 /// description may index with them.
 pub(super) fn check_indices(view: &DescriptionView<'_>) -> Result<(), ArrayFileError> {
     let (n, m) = (view.vertices.len(), view.faces.len());
@@ -251,7 +252,7 @@ pub(super) fn check_indices(view: &DescriptionView<'_>) -> Result<(), ArrayFileE
     below("face_map", view.face_map, m)
 }
 
-/// What the header of an array file says: where each array is, and the rest of the description.
+/// The header of an array file: the position of each array, and the rest of the description.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Layout {
     pub(super) area: f64,

@@ -1,4 +1,4 @@
-//! Arrays go into a safetensors file as they come, each piece to its place: none has to be in memory whole.
+//! Writes arrays to a safetensors file in pieces, so that none has to be in memory as a whole.
 
 use super::array_file::header;
 use safetensors::tensor::Dtype;
@@ -7,14 +7,14 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 
-/// A safetensors file whose arrays are being written.
+/// A safetensors file with partly written arrays.
 #[derive(Debug)]
 pub struct ArrayStream {
     file: File,
     places: Vec<Place>,
 }
 
-/// Where the data of an array is.
+/// The position of the data of an array.
 #[derive(Debug)]
 struct Place {
     begin: u64,
@@ -22,11 +22,11 @@ struct Place {
 }
 
 impl ArrayStream {
-    /// A file, in place of what is at `path`, with the header for arrays of these names, types and
-    /// shapes, and zeros for their values.
+    /// Creates a file, which replaces the one at `path`, with the header for arrays of these names,
+    /// types and shapes, and zeros as their values.
     ///
     /// # Errors
-    /// The file cannot be created, or not be made as long.
+    /// If the file cannot be created or extended to its length.
     pub fn create(path: &Path, arrays: &[(&str, Dtype, Vec<usize>)]) -> io::Result<Self> {
         let header = header(None, arrays.iter().map(|a| (a.0, a.1, a.2.as_slice())));
         let mut begin = header.len() as u64;
@@ -46,10 +46,10 @@ impl ArrayStream {
     /// `first` on.
     ///
     /// # Errors
-    /// The disk is full, or another error of the file.
+    /// If the disk is full, or another error of the file occurs.
     ///
     /// # Panics
-    /// The values do not fit into the array.
+    /// If the values do not fit into the array.
     pub fn write<T: bytemuck::NoUninit>(
         &self,
         array: usize,

@@ -1,7 +1,7 @@
 //! Verifies everything on disk against the catalog.
 //!
-//! Reads only, and may run beside the daemon: the catalog is seen as of one moment, and a file that
-//! is missing counts only if the row that names it is still there afterwards.
+//! It only reads, and may run beside the daemon: it sees the catalog at one moment, and a missing
+//! file counts only if its row still exists afterwards.
 
 use super::agreement::KeptMaps;
 use super::catalog::KEPT_LABEL_VERSIONS;
@@ -18,19 +18,19 @@ use rusqlite::types::FromSql;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-/// Something wrong, or worth knowing, about one file or row.
+/// A fault or a note about one file or row.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
-    /// File, relative to the library, or table and key.
+    /// The file, relative to the library, or the table and key.
     pub place: String,
-    /// What is wrong.
+    /// The fault.
     pub message: String,
-    /// Whether data is lost or wrong; false for orphans that the next sweep removes, and for maps that do not agree with
-    /// others.
+    /// Whether data are lost or wrong. It is false for orphans that the next sweep removes, and for
+    /// maps that disagree with others.
     pub damage: bool,
 }
 
-/// What the arrays of a description say, as far as rows refer to it.
+/// The data of a description that rows refer to.
 struct Arrays {
     n_polygons: u64,
     n_vertices: usize,
@@ -40,7 +40,7 @@ struct Arrays {
 /// Verifies the library in `dir`: the catalog's pages and references, the sum of every row, every
 /// object file's length, BLAKE3 and content, and that shapes, labels, maps and events fit together.
 ///
-/// Damage is found, not an error: errors are reserved for what keeps it from being looked for. It
+/// Damage is a finding, not an error: errors mean that the search for damage failed. The check
 /// takes about as long as reading all files once.
 pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     let mut findings = Findings::default();
@@ -71,7 +71,7 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
         }
         Err(error) => return Err(error),
     };
-    // One snapshot for all that is asked of the catalog; writers go on.
+    // One snapshot serves all queries of the catalog, while writers continue.
     connection.execute_batch("BEGIN")?;
     let reader = Reader::new(&connection);
     findings.take(CATALOG_FILE, |f| check_pages(&connection, f));
@@ -105,7 +105,7 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     match witness {
         _ if n_orphans == 0 => {}
         _ if is_short => findings.damage("originals", text),
-        // What was being added when a process ended, and no more.
+        // The other changes were interrupted additions, and nothing else.
         Found::Whole(_) => {}
         Found::Missing | Found::Damaged(_) => findings.note(
             "originals".into(),
@@ -118,7 +118,7 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     Ok(findings.list)
 }
 
-/// Findings so far, each once: one cause may be met on several ways.
+/// The findings so far, without duplicates: one cause may be found in several ways.
 #[derive(Default)]
 struct Findings {
     list: Vec<Finding>,
@@ -160,7 +160,7 @@ impl Findings {
         }
     }
 
-    /// Runs one part; what keeps it from going on is a finding, and the next part runs.
+    /// Runs one part; an error that stops it becomes a finding, and the next part runs.
     fn take(&mut self, place: &str, part: impl FnOnce(&mut Self) -> Result<(), StoreError>) {
         match part(self) {
             Ok(()) => {}
@@ -171,13 +171,13 @@ impl Findings {
         }
     }
 
-    /// The value, or a finding.
+    /// The value, or a finding in its place.
     fn keep<T>(&mut self, value: Result<T, StoreError>) -> Option<T> {
         value.map_err(|error| self.error(&error)).ok()
     }
 }
 
-/// All keys of a table, read without their rows.
+/// All keys of a table, without their rows.
 fn keys<A: FromSql, B: FromSql>(
     connection: &Connection,
     table: &str,
@@ -186,7 +186,7 @@ fn keys<A: FromSql, B: FromSql>(
     let sql = format!("SELECT {columns} FROM {table} ORDER BY {columns}");
     let mut statement = connection.prepare(&sql)?;
     let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?;
-    // A key that is not even of its type was found by its sum.
+    // A key of the wrong type was already found by its sum.
     Ok(rows.flatten().collect())
 }
 
@@ -266,7 +266,7 @@ fn file_is_missing(dir: &Path, row: &ObjectRow) -> bool {
     !dir.join(&row.file).exists()
 }
 
-/// Asks the catalog as it is now, not as it was when the check began.
+/// Looks in the present catalog, rather than the one at the beginning of the check.
 fn still_catalogued(path: &Path, row: &ObjectRow) -> Result<bool, StoreError> {
     let connection = catalog::open_reader(path)?;
     Reader::new(&connection).is_catalogued(&row.file)
@@ -291,7 +291,7 @@ fn check_shapes(
                 findings.damage(&place, format!("no object {digest} of kind {kind:?}"));
             }
         }
-        // A description that cannot be opened was found with its file.
+        // A description that cannot be opened was already found with its file.
         let described = arrays.get(&shape.description_digest);
         if let Some(described) = described.filter(|d| d.n_polygons != shape.n_polygons) {
             let (row, file) = (shape.n_polygons, described.n_polygons);
@@ -328,7 +328,7 @@ fn check_labels(
         );
         findings.damage(&place, message);
     }
-    // Before the newest ones, versions are kept that a correction needs to be undone.
+    // Versions before the newest ones are kept if undoing a correction needs them.
     let first = shape.version.saturating_sub(KEPT_LABEL_VERSIONS - 1);
     let is_gap = |pair: &[u64]| pair[1] != pair[0] + 1 && pair[1] > first;
     if versions.windows(2).any(is_gap) {
@@ -442,7 +442,7 @@ fn check_maps(
     Ok(())
 }
 
-/// That a pointwise map is one from the `n2` vertices of one shape to the `n1` of another.
+/// Checks that a pointwise map leads from the `n2` vertices of one shape to the `n1` of another.
 fn check_p2p(findings: &mut Findings, place: &str, p2p_21: &[u32], (n1, n2): (usize, usize)) {
     if p2p_21.len() != n2 {
         let found = p2p_21.len();
@@ -489,7 +489,7 @@ fn check_collections(
     Ok(())
 }
 
-/// The log of a name holds every number from 1 to its sequence, once.
+/// Checks that the log of a name contains every number from 1 to its sequence once.
 fn check_events(connection: &Connection, findings: &mut Findings) -> Result<(), StoreError> {
     let mut statement = connection.prepare(
         "SELECT name, streams.sequence, count(events.sequence), coalesce(min(events.sequence), 1),
@@ -541,7 +541,7 @@ fn check_jobs(
     Ok(())
 }
 
-/// Names files that no row names; how many of them are mesh files.
+/// Reports files without a row; returns how many of them are mesh files.
 fn check_orphans(
     dir: &Path,
     rows: &[ObjectRow],
@@ -565,7 +565,7 @@ fn check_orphans(
             .map_err(|e| StoreError::io(&path, e))?
         {
             let file = relative(dir, &entry.path);
-            // It may have been committed since the check began.
+            // The file may have been committed since the check began.
             if named.contains(file.as_str()) || reader.is_catalogued(&file).unwrap_or(false) {
                 continue;
             }

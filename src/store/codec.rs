@@ -1,12 +1,12 @@
-//! Arrays and opaque bytes become compact blobs of the catalog and back.
+//! Packs arrays and opaque bytes as compact blobs for the catalog, and unpacks them.
 //!
 //! A packed blob is one byte of element width (1, 2 or 4), the number of elements (u32), and a zstd
-//! frame of the little-endian elements. Labels are stored plus one, so that -1 and small ids fit a
-//! byte.
+//! frame of the little-endian elements. Labels are stored plus one, so that -1 and small ids fit
+//! into a byte.
 
 use std::io::{self, Read};
 
-/// A blob that is not what packing makes.
+/// A blob that packing cannot have produced.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub(super) struct BadBlob(String);
@@ -31,7 +31,7 @@ fn pack(width: u8, count: usize, bytes: &[u8]) -> Vec<u8> {
     blob
 }
 
-/// Width and content; the content has exactly the number of elements the header says.
+/// Width and content; the content has exactly the number of elements in the header.
 fn unpack(blob: &[u8]) -> Result<(u8, Vec<u8>), BadBlob> {
     let Some((header, frame)) = blob.split_first_chunk::<HEADER>() else {
         return bad(format!(
@@ -133,7 +133,7 @@ pub(super) fn unpack_labels(blob: &[u8]) -> Result<Vec<i32>, BadBlob> {
         .collect())
 }
 
-/// Floats are stored as they are: they hardly compress.
+/// Floats are stored uncompressed, since they hardly compress.
 pub(super) fn floats_to_blob(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }

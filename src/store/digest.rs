@@ -1,4 +1,4 @@
-//! A 256-bit BLAKE3 digest: the name of immutable bytes.
+//! A 256-bit BLAKE3 digest, which names immutable bytes.
 
 use rusqlite::types::{FromSql, FromSqlError, FromSqlResult, ToSql, ToSqlOutput, ValueRef};
 use std::fmt;
@@ -14,7 +14,7 @@ impl Digest {
         Self(*blake3::hash(bytes).as_bytes())
     }
 
-    /// The digest of pieces that follow each other.
+    /// The digest of consecutive pieces.
     pub fn of_pieces(pieces: &[&[u8]]) -> Self {
         let mut hasher = blake3::Hasher::new();
         for piece in pieces {
@@ -23,9 +23,9 @@ impl Digest {
         Self(*hasher.finalize().as_bytes())
     }
 
-    /// The name of a description: the digest of the original's digest, the parameters it was
-    /// computed with and the algorithm (its version, and whatever else decides the bits). Each is
-    /// prefixed with its length, so that no two triples run together.
+    /// The name of a description: the digest of the original's digest, the parameters and the
+    /// algorithm (its version, and everything else that determines the bits). Each is prefixed with
+    /// its length, so that different triples have different inputs.
     pub fn of_description(original: &Digest, params: &str, algorithm: &str) -> Self {
         let mut hasher = blake3::Hasher::new_derive_key("coseg description 1");
         for field in [&original.0[..], params.as_bytes(), algorithm.as_bytes()] {

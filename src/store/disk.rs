@@ -1,4 +1,4 @@
-//! The few file operations that object files are made with, so that each can be made to fail.
+//! Abstracts the few file operations of object files, so that tests can make each of them fail.
 
 use rustix::fs::OFlags;
 use rustix::io::Errno;
@@ -16,14 +16,14 @@ pub trait NewFile {
     fn sync(&mut self) -> io::Result<()>;
 }
 
-/// What a folder holds.
+/// An entry of a folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     /// The file's path.
     pub path: PathBuf,
-    /// Bytes in it.
+    /// Its length in bytes.
     pub length: u64,
-    /// When it was last written.
+    /// The time at which it was last written.
     pub modified: SystemTime,
 }
 
@@ -31,9 +31,9 @@ pub struct Entry {
 pub trait Disk: Send + Sync {
     /// Creates one folder; true if it was not there before.
     fn create_dir(&self, path: &Path) -> io::Result<bool>;
-    /// Creates a file that must not exist.
+    /// Creates a new file; fails if it exists.
     fn create(&self, path: &Path) -> io::Result<Box<dyn NewFile + '_>>;
-    /// Renames atomically, replacing what is at `to`.
+    /// Renames atomically, replacing an existing file at `to`.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
     /// Returns once the names in a folder are durable.
     fn sync_dir(&self, path: &Path) -> io::Result<()>;
@@ -41,7 +41,7 @@ pub trait Disk: Send + Sync {
     fn remove(&self, path: &Path) -> io::Result<()>;
     /// Removes an empty folder.
     fn remove_dir(&self, path: &Path) -> io::Result<()>;
-    /// Whether there is a file or folder.
+    /// Whether a file or folder exists.
     fn exists(&self, path: &Path) -> bool;
     /// All bytes of a file; `NotFound` if there is none.
     fn read(&self, path: &Path) -> io::Result<Vec<u8>>;
@@ -55,8 +55,8 @@ pub struct RealDisk;
 
 struct RealFile(File);
 
-/// Opens a file that a library holds: not a link, a device or a pipe that somebody has put in its place, which might never
-/// end.
+/// Opens a file of a library; rejects a link, a device or a pipe that somebody has put in its
+/// place, since reading it might never end.
 pub(super) fn open_regular(path: &Path) -> io::Result<File> {
     let other = || io::Error::new(io::ErrorKind::InvalidData, "it is not a regular file");
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
@@ -66,7 +66,7 @@ pub(super) fn open_regular(path: &Path) -> io::Result<File> {
         .open(path);
     let file = match opened.map_err(|e| (Errno::from_io_error(&e), e)) {
         Ok(file) => file,
-        // A link; a socket.
+        // The error is that of a link or a socket.
         Err((Some(Errno::LOOP | Errno::NXIO), _)) => return Err(other()),
         Err((_, e)) => return Err(e),
     };
@@ -76,7 +76,8 @@ pub(super) fn open_regular(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Whether an error of [`open_regular`] says that the file is not there any more, as opposed to a trouble that passes.
+/// Whether an error of [`open_regular`] means that the file does not exist, rather than a temporary
+/// failure.
 pub(super) fn is_gone(error: &io::Error) -> bool {
     matches!(
         error.kind(),

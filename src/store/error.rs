@@ -1,9 +1,9 @@
-//! Why the store refused or failed.
+//! The errors of the store.
 
 use rusqlite::ErrorCode;
 use std::path::Path;
 
-/// Why the store refused or failed.
+/// The reason why the store refused or failed.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages say it
 pub enum StoreError {
@@ -12,12 +12,12 @@ pub enum StoreError {
         path: String,
         source: std::io::Error,
     },
-    /// Nothing was changed; works again once there is space.
+    /// The disk is full. The operation changed nothing, and succeeds once there is space.
     #[error("{path}: no space left on the device")]
     NoSpace { path: String },
     #[error("{path}: {message}")]
     Damaged { path: String, message: String },
-    /// A row of the catalog that cannot be what was written.
+    /// A row of the catalog differs from what was written.
     #[error("catalog: {table} {key}: {message}")]
     DamagedRow {
         table: &'static str,
@@ -52,11 +52,11 @@ pub enum StoreError {
     ReadOnly { since: String, cause: String },
 }
 
-/// The catalog's file, as errors name it.
+/// The name of the catalog's file in errors.
 pub(super) const CATALOG_FILE: &str = "catalog.db";
 
 impl StoreError {
-    /// An input or output error at `path`; a full disk is told apart.
+    /// The error for an input or output error at `path`; a full disk gets a variant of its own.
     pub(crate) fn io(path: &Path, source: std::io::Error) -> Self {
         let path = path.display().to_string();
         if is_no_space(&source) {
@@ -66,7 +66,7 @@ impl StoreError {
         }
     }
 
-    /// Whether data on disk is lost or wrong, as opposed to a refusal that passes.
+    /// Whether data on disk are lost or wrong, as opposed to a temporary refusal.
     pub fn is_damage(&self) -> bool {
         matches!(self, Self::Damaged { .. } | Self::DamagedRow { .. })
     }

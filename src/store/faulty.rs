@@ -1,4 +1,4 @@
-//! A file system in memory that fails on demand and can be looked at as after a crash.
+//! A file system in memory that fails on demand and can simulate crashes.
 
 use super::disk::{Disk, Entry, NewFile};
 use rand::{Rng, SeedableRng};
@@ -34,7 +34,7 @@ enum Op {
     RemoveDir(PathBuf),
 }
 
-/// Which operation fails, how, and whether all that follow fail too.
+/// Selects the operation that fails, its error, and whether all later ones fail too.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Fault {
     pub(super) at: usize,
@@ -53,9 +53,9 @@ struct Mem {
     log: Vec<Op>,
     n_operations: usize,
     fault: Option<Fault>,
-    /// What failed syncs were of, and how often one of them was tried again. A folder counts only
-    /// if its sync failed for good: after a full disk the name is taken back, and the next sync is
-    /// about another one.
+    /// The paths of failed syncs, and the number of repeated ones. A folder counts only if its sync
+    /// failed permanently: after a full disk the name is taken back, and the next sync concerns
+    /// another name.
     failed_syncs: BTreeSet<String>,
     n_retried_syncs: usize,
 }
@@ -87,14 +87,14 @@ impl MemDisk {
         self.mem().n_retried_syncs
     }
 
-    /// Another process goes on: what an earlier one saw fail is not its business.
+    /// Simulates a new process, which does not know the failures that an earlier one saw.
     pub(super) fn restart(&self) {
         self.mem().failed_syncs.clear();
     }
 
-    /// The disk as it may be found after a crash that came after `n_logged` operations. What was
-    /// synced is there; of the rest each write is kept, dropped or torn and each change of a name
-    /// kept or dropped, independently of the others. Seed 0 drops everything that was not synced.
+    /// A state of the disk after a crash that follows `n_logged` operations. Synced data are
+    /// present; of the rest each write is kept, dropped or torn and each change of a name kept or
+    /// dropped, independently of the others. Seed 0 drops everything that was not synced.
     pub(super) fn after_crash(&self, n_logged: usize, seed: u64) -> Self {
         let mem = self.mem();
         let log = &mem.log[..n_logged];
@@ -147,7 +147,7 @@ impl MemDisk {
                     if luck(synced_after(at, &same)) {
                         content.extend(bytes);
                     } else if luck(false) {
-                        // Torn: some blocks arrived, the others are zeros.
+                        // A torn write: some blocks arrived, the others are zeros.
                         for block in bytes.chunks(16) {
                             let arrived = luck(false);
                             content.extend(block.iter().map(|&b| if arrived { b } else { 0 }));
@@ -157,7 +157,7 @@ impl MemDisk {
                 Op::Sync { .. } | Op::SyncDir(_) => {}
             }
         }
-        // What lies in a folder that is gone is gone.
+        // Files in a missing folder are missing.
         let folders = image.folders.clone();
         let reachable = |path: &Path| {
             path.ancestors()
@@ -176,7 +176,7 @@ impl MemDisk {
             .expect("no test panics while it holds the disk")
     }
 
-    /// Counts an operation that takes no space: a full disk does not keep it from working.
+    /// Counts an operation that takes no space, so that it succeeds on a full disk.
     fn begin_without_space(&self) -> io::Result<MutexGuard<'_, Mem>> {
         if self.mem().fault.is_some_and(|fault| fault.errno == ENOSPC) {
             let mut mem = self.mem();
@@ -186,7 +186,7 @@ impl MemDisk {
         self.begin()
     }
 
-    /// Counts an operation; the error if it is to fail.
+    /// Counts an operation; returns its error if it is to fail.
     fn begin(&self) -> io::Result<MutexGuard<'_, Mem>> {
         let mut mem = self.mem();
         let at = mem.n_operations;
@@ -227,7 +227,7 @@ struct MemFile<'d> {
 
 impl NewFile for MemFile<'_> {
     fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
-        // A write that fails may have got half way.
+        // A failing write may have been partly done.
         let (result, bytes) = match self.disk.begin() {
             Ok(_) => (Ok(()), bytes),
             Err(e) => (Err(e), &bytes[..bytes.len() / 2]),

@@ -1,14 +1,14 @@
-//! One failed sync makes the store read-only for as long as the process lives.
+//! Makes the store read-only for the rest of the process after one failed sync.
 //!
 //! After a failed `fsync` the kernel may have dropped the pages and marked them clean, so a second
-//! `fsync` that succeeds proves nothing (PostgreSQL's "fsyncgate"). The only honest answers are to
-//! refuse further writes, to keep serving what was durable, and to say so.
+//! `fsync` that succeeds proves nothing (PostgreSQL's "fsyncgate"). The only honest answer is to
+//! refuse further writes, to keep serving durable data, and to report the failure.
 
 use super::StoreError;
 use std::sync::{Arc, OnceLock};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Shared by everything that writes; writable until the first failed sync.
+/// The state that all writers share; writable until the first failed sync.
 #[derive(Debug, Clone, Default)]
 pub struct Health(Arc<OnceLock<Stop>>);
 
@@ -19,7 +19,7 @@ struct Stop {
 }
 
 impl Health {
-    /// An error once writes are refused.
+    /// Returns an error once writes are refused.
     pub fn writable(&self) -> Result<(), StoreError> {
         match self.0.get() {
             None => Ok(()),
@@ -30,14 +30,14 @@ impl Health {
         }
     }
 
-    /// When and why writes are refused; `None` while they are not.
+    /// The time and the cause of the failure; `None` while writes are accepted.
     pub fn read_only(&self) -> Option<(&str, &str)> {
         self.0
             .get()
             .map(|stop| (stop.since.as_str(), stop.cause.as_str()))
     }
 
-    /// Refuses all writes from now on, and returns the error that says so.
+    /// Refuses all writes from now on, and returns the corresponding error.
     pub(crate) fn stop(&self, cause: String) -> StoreError {
         let stop = self.0.get_or_init(|| Stop {
             since: utc(SystemTime::now()),
@@ -50,7 +50,7 @@ impl Health {
     }
 }
 
-/// RFC 3339 in UTC. The date is Hinnant's `civil_from_days`.
+/// Formats a time as RFC 3339 in UTC. The date is Hinnant's `civil_from_days`.
 fn utc(time: SystemTime) -> String {
     let secs = time.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let (days, rest) = (secs / 86_400 + 719_468, secs % 86_400);

@@ -1,4 +1,4 @@
-//! One process at a time holds a library folder.
+//! Locks a library folder, so that one process at a time holds it.
 
 use super::StoreError;
 use rustix::fs::{FlockOperation, flock};
@@ -10,16 +10,17 @@ use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// The file that is locked, in the library's folder.
+/// The lock file in the library's folder.
 pub const LOCK_FILE: &str = "lock";
 
 /// The folder in a library that readers lock against the removal of files.
 const LOCKED_FOLDER: &str = "objects";
 
-/// A process that was killed may have left a child between fork and exec, which shares its open files
-/// for a moment.
+/// Time to wait for a lock: a killed process may have left a child between fork and exec, which
+/// briefly shares its open files.
 const PATIENCE: Duration = Duration::from_millis(300);
-/// The same, where the process that the lock file names is gone: then those that it let hold the library too are ending.
+/// Time to wait if the process named in the lock file is gone: the processes that shared its lock
+/// are then ending.
 const PATIENCE_AFTER_DEATH: Duration = Duration::from_secs(10);
 
 /// An exclusive lock on a library folder. The kernel releases it when the process ends, however it
@@ -31,15 +32,16 @@ pub struct LibraryLock {
 
 impl Drop for LibraryLock {
     fn drop(&mut self) {
-        // Closing is not enough: the lock belongs to the open file, which a child that some other thread
-        // has forked shares until it has become another program.
+        // Closing is not enough: the lock belongs to the open file, which a child forked by another
+        // thread shares until it becomes another program.
         let _ = flock(&self.file, FlockOperation::Unlock);
     }
 }
 
 impl LibraryLock {
-    /// Takes the lock, or says within a third of a second that a running process holds it. The lock file names the
-    /// holder's process id; it is never removed, since removing it would let two processes lock two different files.
+    /// Takes the lock, or fails within a third of a second if a running process holds it. The lock
+    /// file contains the holder's process id. It is never removed, since otherwise two processes
+    /// could lock two different files.
     pub fn acquire(dir: &Path) -> Result<Self, StoreError> {
         let path = dir.join(LOCK_FILE);
         let file = File::options()
@@ -70,27 +72,28 @@ impl LibraryLock {
         Ok(lock)
     }
 
-    /// Tells whoever finds the library held where the holder can be asked.
+    /// Writes the address of the holder for processes that find the library locked.
     pub(super) fn tell(&self, endpoint: &str) -> std::io::Result<()> {
         self.write(endpoint)
     }
 
-    /// The process id on the first line, the endpoint, if there is one, on the second: one write,
-    /// so that nobody reads half of it but between the two steps, when there is nothing.
+    /// Writes the process id on the first line, and the endpoint, if there is one, on the second.
+    /// It is one write, so that readers see either all of it or, between the two steps, an empty
+    /// file.
     fn write(&self, endpoint: &str) -> std::io::Result<()> {
         let text = format!("{}\n{endpoint}\n", std::process::id());
         self.file.set_len(0)?;
         self.file.write_all_at(text.as_bytes(), 0)
     }
 
-    /// Lets processes that are started from now on hold the lock too, for as long as they live.
+    /// Lets processes that are started from now on share the lock, for as long as they live.
     pub(super) fn share(&self) -> std::io::Result<()> {
         Ok(fcntl_setfd(&self.file, FdFlags::empty())?)
     }
 }
 
-/// What a lock file says of who holds it. Words for people and a hint of how long to wait: nothing
-/// else follows from it.
+/// The holder according to a lock file. It only serves messages and the time to wait; nothing else
+/// depends on it.
 #[derive(Debug, Default, PartialEq)]
 struct Holder {
     pid: Option<Pid>,
@@ -116,7 +119,7 @@ impl Holder {
         matches!(found, Some(Err(rustix::io::Errno::SRCH)))
     }
 
-    /// `process 7, a daemon at ipc:///x; …`.
+    /// Describes the holder: `process 7, a daemon at ipc:///x; …`.
     fn in_words(&self) -> String {
         let Some(pid) = self.pid.map(Pid::as_raw_nonzero) else {
             return "another process".to_owned();
@@ -135,7 +138,7 @@ impl Holder {
     }
 }
 
-/// How long to try.
+/// The time to wait for a lock.
 fn patience(lock: &Path) -> Duration {
     match Holder::read(lock).is_gone() {
         true => PATIENCE_AFTER_DEATH,
@@ -171,7 +174,7 @@ mod tests {
                 ", the daemon at ipc:///run/x/coseg.sock; `coseg stop --endpoint ipc:///run/x/coseg.sock` ends it"
             )
         );
-        // What another has left there says nothing of the next.
+        // The data of an earlier holder do not describe the next one.
         drop(lock);
         std::fs::write(directory.path().join(LOCK_FILE), "1\nipc:///stale\nmore\n").unwrap();
         let _again = LibraryLock::acquire(directory.path()).unwrap();
@@ -195,19 +198,20 @@ mod tests {
     }
 }
 
-/// A folder that is locked; the folder itself, so that it needs no file and no right to write.
+/// A locked folder. The folder itself is locked, so that neither a file nor write permission is
+/// needed.
 #[derive(Debug)]
 pub(super) struct Locked(File);
 
 impl Drop for Locked {
     fn drop(&mut self) {
-        // As for [`LibraryLock`].
+        // Closing is not enough, as for [`LibraryLock`].
         let _ = flock(&self.0, FlockOperation::Unlock);
     }
 }
 
 impl Locked {
-    /// Locks a folder for this alone, if nobody else has it locked.
+    /// Locks a folder exclusively, if no other process has locked it.
     pub(super) fn try_exclusive(folder: &Path) -> io::Result<Option<Self>> {
         let locked = Self(File::open(folder)?);
         match flock(&locked.0, FlockOperation::NonBlockingLockExclusive) {
@@ -224,8 +228,8 @@ impl Locked {
     }
 }
 
-/// While it is there no file of a library is removed, in whichever process: for whoever reads the catalog and then, one
-/// after the other, the files that it names.
+/// A guard during which no file of a library is removed, in any process. Readers of the catalog
+/// hold it while they open the files that it names.
 #[derive(Debug)]
 pub(super) struct Reading {
     _locked: Option<Locked>,
@@ -238,14 +242,14 @@ impl Reading {
             Ok(locked) => Ok(Self {
                 _locked: Some(locked),
             }),
-            // Then there are no files.
+            // Without the folder there are no files.
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(Self { _locked: None }),
             Err(e) => Err(StoreError::io(&folder, e)),
         }
     }
 }
 
-/// For whoever removes files; nothing while somebody reads.
+/// Locks for removing files; returns `None` while a reader holds its guard.
 pub(super) fn try_removing(library: &Path) -> Result<Option<Locked>, StoreError> {
     let folder = library.join(LOCKED_FOLDER);
     Locked::try_exclusive(&folder).map_err(|e| StoreError::io(&folder, e))

@@ -1,9 +1,9 @@
-//! An array file becomes a [`DescriptionView`]: memory-mapped, checked once, not copied.
+//! Maps an array file into memory as a [`DescriptionView`]: checked once, not copied.
 //!
 //! Committed files never change and are mapped for reading only. Before the first access the length
-//! is compared with the catalog's and the pages are populated by a system call that fails where an
-//! access would raise SIGBUS (a truncated file, a bad sector); then the header and, if asked for,
-//! the BLAKE3 are checked.
+//! is compared with the catalog's, and the pages are populated by a system call that returns an
+//! error where an access would raise SIGBUS (a truncated file, a bad sector). Then the header is
+//! checked and, on request, the BLAKE3.
 
 #![allow(unsafe_code)]
 
@@ -24,7 +24,7 @@ use std::sync::Arc;
 compile_error!("array files are little-endian and used where they are mapped");
 
 /// A description whose arrays are mapped from its file. Clones share the mapping, which stays valid
-/// when the file is removed.
+/// after the file is removed.
 #[derive(Debug, Clone)]
 pub struct MappedDescription(Arc<Mapped>);
 
@@ -37,8 +37,8 @@ struct Mapped {
 impl MappedDescription {
     /// Maps the file at `path` after checking everything about it that can be checked.
     ///
-    /// `expected_len` and `expected_blake3` are what the catalog says; without a digest the content
-    /// of the arrays is taken on trust, except for their indices, which are always in range.
+    /// `expected_len` and `expected_blake3` come from the catalog. Without a digest the contents of
+    /// the arrays are not verified, except for their indices, which are always in range.
     pub fn open(
         path: &Path,
         expected_len: u64,
@@ -79,7 +79,7 @@ impl MappedDescription {
         Ok(mapped)
     }
 
-    /// The arrays, borrowed from the map.
+    /// The arrays, borrowed from the mapping.
     pub fn view(&self) -> DescriptionView<'_> {
         let layout = &self.0.layout;
         DescriptionView {
@@ -99,7 +99,7 @@ impl MappedDescription {
         }
     }
 
-    /// What cleaning found and did.
+    /// The findings and actions of cleaning.
     pub fn report(&self) -> &CleanReport {
         &self.0.layout.report
     }
@@ -109,17 +109,17 @@ impl MappedDescription {
         self.0.layout.area
     }
 
-    /// The parameters it was computed with, as they were given.
+    /// The parameters of its computation, unchanged.
     pub fn params_json(&self) -> &str {
         &self.0.layout.params
     }
 
-    /// Bytes of the file.
+    /// Size of the file in bytes.
     pub fn file_len(&self) -> usize {
         self.0.file.len()
     }
 
-    /// A copy in memory, equal to what was written.
+    /// A copy in memory, equal to the description that was written.
     pub fn to_description(&self) -> Description {
         let view = self.view();
         Description {
@@ -147,12 +147,12 @@ impl MappedDescription {
     }
 }
 
-/// Reads every page of a new mapping in a way that fails with an error where touching it would
-/// raise SIGBUS.
+/// Reads every page of a new mapping in a way that returns an error where an access would raise
+/// SIGBUS.
 fn populate(file: &File, mapped: &Mmap) -> Result<(), ArrayFileError> {
     match mapped.advise(Advice::PopulateRead) {
         Ok(()) => Ok(()),
-        // Kernels before 5.14 do not know the advice. Reading the file brings the same pages into
+        // Kernels before 5.14 do not know the advice. Reading the file loads the same pages into
         // the page cache and reports the same errors.
         Err(e) if e.raw_os_error() == Some(rustix::io::Errno::INVAL.raw_os_error()) => {
             let mut read = 0;

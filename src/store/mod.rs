@@ -1,22 +1,22 @@
-//! Where descriptions, originals and the catalog live on disk.
+//! Stores descriptions, originals and the catalog on disk.
 //!
-//! A library is a folder: `catalog.db` says what exists, `objects/` holds the arrays of each
-//! description, `originals/` the bytes that were sent, `lock` says who holds it, and `tmp/` what is
-//! being written. docs/format.md describes each.
+//! A library is a folder: `catalog.db` records what exists, `objects/` holds the arrays of each
+//! description, `originals/` the original mesh files, `lock` names the process that holds the
+//! library, and `tmp/` contains files that are being written. docs/format.md describes each.
 //!
-//! How something is committed, and why nothing half is ever seen:
+//! A commit takes three steps, so that no reader ever sees half of one:
 //!
-//! 1. [`Objects`] writes a file under `tmp/`, syncs it, renames it to its place and syncs the
-//!    folder. Up to here nothing has happened: a file without a row is an orphan.
+//! 1. [`Objects`] writes a file under `tmp/`, syncs it, renames it to its final name and syncs the
+//!    folder. Up to here nothing is committed: a file without a row is an orphan.
 //! 2. One [`Catalog`] transaction inserts the rows: the objects, the shape, its labels, the changed
 //!    model, the events, the finished job item, the reply. **The catalog row is the only commit
 //!    marker, and it is never durable before the data it names.**
-//! 3. Only when the transaction has returned is anybody told.
+//! 3. The reply and the events are sent only after the transaction has returned.
 //!
-//! A sync that fails makes the store read-only for as long as the process lives ([`Health`]); a full
-//! disk is an error that passes. Committed files never change. The catalog has one writer, and
-//! readers never wait for it. Files that nothing refers to any more are removed soon, what a process
-//! left that ended in the middle when it is a day old, never at start.
+//! A sync that fails makes the store read-only for the rest of the process ([`Health`]); a full
+//! disk is a temporary error. Committed files never change. The catalog has one writer, and readers
+//! never wait for it. Files without references are removed soon, and orphans of interrupted
+//! processes after a day, never at start.
 
 pub mod agreement;
 mod array_file;
@@ -64,21 +64,21 @@ pub struct Store {
     catalog: Catalog,
     health: Health,
     dir: PathBuf,
-    // Last, so that it is released after the catalog is closed. None: another process holds it.
+    // The last field, so that it is released after the catalog is closed. `None`: another process
+    // holds it.
     lock: Option<LibraryLock>,
 }
 
 impl Store {
-    /// Opens the library in `dir`, which is created, readable by its owner's group at most, if it
-    /// is missing.
+    /// Opens the library in `dir`; creates it if missing, readable by its owner's group at most.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         create_library_folder(dir)?;
         let lock = LibraryLock::acquire(dir)?;
         Self::open_with(Catalog::open, dir, Some(lock))
     }
 
-    /// Opens the library in `dir`, which another process holds, to change what that process lets this one change. It must
-    /// be there, in the current format.
+    /// Opens the library in `dir`, which another process holds, for the changes that this process
+    /// may make on its behalf. The library must exist, in the current format.
     pub fn open_beside(dir: &Path) -> Result<Self, StoreError> {
         Self::open_with(Catalog::open_beside, dir, None)
     }
@@ -89,7 +89,8 @@ impl Store {
         lock: Option<LibraryLock>,
     ) -> Result<Self, StoreError> {
         let health = Health::default();
-        // Before the objects' folders, so that their sync of `dir` covers the catalog's name.
+        // Opened before the objects' folders, so that their sync of `dir` covers the catalog's
+        // name.
         let catalog = open_catalog(&catalog::path_in(dir), health.clone())?;
         let disk: Arc<dyn Disk> = Arc::new(RealDisk);
         let objects = Objects::open(disk, dir, health.clone())?;
@@ -105,8 +106,8 @@ impl Store {
         })
     }
 
-    /// Lets the processes that this one starts from now on hold the library too, until they end: nobody else opens it
-    /// while one of them may still write.
+    /// Lets processes that this one starts from now on share the lock until they end: no other
+    /// process opens the library while one of them may still write.
     pub fn share_lock(&self) -> Result<(), StoreError> {
         match &self.lock {
             Some(lock) => lock.share().map_err(|e| StoreError::io(&self.dir, e)),
@@ -114,7 +115,7 @@ impl Store {
         }
     }
 
-    /// Tells whoever finds the library held where its holder listens.
+    /// Records the endpoint of the holder for processes that find the library locked.
     pub fn tell_endpoint(&self, endpoint: &str) -> Result<(), StoreError> {
         match &self.lock {
             Some(lock) => lock
@@ -134,7 +135,7 @@ impl Store {
         &self.catalog
     }
 
-    /// Whether writes are refused, and since when and why.
+    /// Whether writes are refused, with the time and the cause.
     pub fn health(&self) -> &Health {
         &self.health
     }
@@ -144,9 +145,11 @@ impl Store {
         &self.dir
     }
 
-    /// Lets go what no shape and no queued item needs any more: its rows now, its files for [`Store::reclaim`]. How many.
+    /// Releases object files that neither a shape nor a queued item needs: deletes their rows now,
+    /// and leaves the files to [`Store::reclaim`]. Returns their number.
     pub fn release_unreferenced(&self) -> Result<usize, StoreError> {
-        // Looked for beside the writer first, which mostly has nothing to do.
+        // Searched with a reader first, since there is usually nothing to release and the writer
+        // stays free.
         if !self
             .catalog
             .read(|reader| reader.has_unreferenced_objects())?
@@ -161,8 +164,9 @@ impl Store {
         Ok(n_files)
     }
 
-    /// Removes the files that this process has let go so long ago, unless a row names them again or somebody is about to
-    /// name them. Returns the removed files; while a copy of the library is made, in whichever process, there are none.
+    /// Removes files that this process released at least `grace` ago, unless a row names them again
+    /// or a writer is about to do so. Returns the removed files; none while any process copies the
+    /// library.
     pub fn reclaim(&self, grace: Duration) -> Result<Vec<String>, StoreError> {
         let mut files = Vec::new();
         for file in self.objects.let_go_since(grace) {
@@ -191,11 +195,11 @@ impl Store {
         Ok(removed)
     }
 
-    /// Removes what nothing needs any more: the rows of unreferenced object files now, files
-    /// without a row once they have been orphans for `min_age` (of what this process did not do
-    /// itself, the file's age counts). Returns the removed files.
+    /// Removes unneeded data: the rows of unreferenced object files now, and files without a row
+    /// once they have been orphans for `min_age` (for files of other processes, the file's age
+    /// counts). Returns the removed files.
     ///
-    /// For a daemon to call about hourly with [`objects::ORPHAN_AGE`], never at start.
+    /// A daemon should call it about hourly with [`objects::ORPHAN_AGE`], never at start.
     pub fn sweep_orphans(&self, min_age: Duration) -> Result<Vec<String>, StoreError> {
         self.release_unreferenced()?;
         let Some(_removing) = lock::try_removing(&self.dir)? else {
@@ -219,7 +223,7 @@ impl Store {
         Ok(found)
     }
 
-    /// Carries out a change that frees space; on a full disk once more, with the room that is kept for it.
+    /// Runs a change that frees space; on a full disk repeats it, using the reserved space.
     pub fn freeing<T, E: FullDisk>(
         &self,
         mut change: impl FnMut() -> Result<T, E>,
@@ -230,7 +234,7 @@ impl Store {
         }
     }
 
-    /// Keeps room for changes that free space, if there is more than that.
+    /// Reserves space for changes that free space, if there is enough.
     pub fn keep_reserve(&self) {
         reserve::keep(&self.dir);
     }
@@ -239,17 +243,17 @@ impl Store {
         self.catalog.read(|reader| reader.is_catalogued(file))
     }
 
-    /// A process that was killed at the end of its commit may have left it whole in the log, where nobody sees it until the
-    /// log is recovered after a crash. Files that it names must not be gone by then: the commit that this makes is written
-    /// over it.
+    /// A process that was killed at the end of its commit may have left the commit complete in the
+    /// log, invisible until recovery after a crash. Recovery must not bring back rows whose files
+    /// are gone by then; the commit that this function makes overwrites it.
     fn bury_interrupted_commits(&self) -> Result<(), StoreError> {
         self.freeing(|| self.catalog.write(|tx| tx.touch()))
     }
 }
 
-/// Errors that may say that the disk is full.
+/// Errors that may mean that the disk is full.
 pub trait FullDisk: From<StoreError> {
-    /// Whether it is, and nothing was changed.
+    /// Whether the disk is full and nothing was changed.
     fn is_full_disk(&self) -> bool;
 }
 
@@ -259,7 +263,7 @@ impl FullDisk for StoreError {
     }
 }
 
-/// Creates the folder and its parents, names durable.
+/// Creates the folder and its parents, with durable names.
 fn create_library_folder(dir: &Path) -> Result<(), StoreError> {
     use std::os::unix::fs::DirBuilderExt;
     if dir.is_dir() {
@@ -277,7 +281,7 @@ fn create_library_folder(dir: &Path) -> Result<(), StoreError> {
         }
         _ => {}
     }
-    // Folders like / may not be opened by everyone; then their names are not ours to sync.
+    // Folders like / may not be readable for everyone; syncing their names is then not possible.
     match RealDisk.sync_dir(parent) {
         Err(e) if e.kind() != std::io::ErrorKind::PermissionDenied => {
             Err(StoreError::io(parent, e))

@@ -1,11 +1,13 @@
-//! Immutable, content-addressed files: the array file of each description and the original bytes.
+//! Stores immutable, content-addressed files: the array file of each description and the original
+//! bytes.
 //!
-//! A file is written under `tmp/`, synced, renamed to its place and its folder is synced; only then
-//! does the caller write the catalog row that names it, with length and digest. That row is the only
-//! commit marker: a file without one does not count. What this process put or let go is removed soon
-//! after nothing needs it; what another left behind is swept after a day. A file in its place is
-//! complete and never changes; where other bytes turn out to be needed under a name that is taken,
-//! they get a name of their own beside it, so that a row never speaks of bytes that were replaced.
+//! A file is written under `tmp/`, synced and renamed to its final name, and its folder is synced.
+//! Only then does the caller write the catalog row that names it, with length and digest. That row
+//! is the only commit marker: a file without one does not count. Files that this process wrote or
+//! released are removed soon after nothing needs them; orphans of other processes are swept after a
+//! day. A file with a final name is complete and never changes. Where other bytes are needed under
+//! a name that exists, they get a name of their own beside it, so that a row never refers to
+//! replaced bytes.
 
 use super::array_file::DescriptionFile;
 use super::codec::decompress;
@@ -22,18 +24,18 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Bytes of array files that stay mapped between uses, unless told otherwise.
+/// Default size of array files that stay mapped between uses, in bytes.
 pub const DEFAULT_CACHE_BYTES: usize = 16 << 20;
 
-/// Orphans younger than this may belong to work that is under way.
+/// Orphans younger than this may belong to unfinished work.
 pub const ORPHAN_AGE: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// Of the levels below 7 the one beyond which OBJ text hardly shrinks further.
+/// Of the levels below 7, OBJ text hardly shrinks further beyond this one.
 const ZSTD_LEVEL: i32 = 3;
 
 const TEMPORARY: &str = "tmp";
 
-/// The folders that hold object files, or what is to become one.
+/// The folders of object files, and of files that may become object files.
 pub(super) const FOLDERS: [&str; 3] = ["objects", "originals", TEMPORARY];
 
 /// The object files of one library.
@@ -41,19 +43,22 @@ pub struct Objects {
     disk: Arc<dyn Disk>,
     root: PathBuf,
     health: Health,
-    /// One file of a name is published at a time, so that nobody finds a name that may yet be taken back. By the first
-    /// digits, so that files under different folders do not wait for each other.
+    /// Files of one name are published one at a time, so that no process finds a name that may yet
+    /// be taken back. There is a lock for each prefix of a digest, so that files in different
+    /// folders do not wait for each other.
     publishing: [Mutex<()>; 256],
     state: Arc<Mutex<State>>,
 }
 
 struct State {
-    /// Files that something in this process may be about to name in the catalog, and by how many.
+    /// Files that writers in this process may be about to name in the catalog, with the number of
+    /// such writers.
     held: HashMap<String, usize>,
-    /// Files that nobody holds any more, or whose rows are gone, and since when: whoever found a row may be about to open
-    /// its file. The monotonic clock decides, so that a jump of the wall clock removes nothing.
+    /// Files that are not held any more, or whose rows are deleted, with the time: a reader that
+    /// found a row may be about to open its file. Times are of the monotonic clock, so that a jump
+    /// of the wall clock removes no file.
     let_go: HashMap<String, Instant>,
-    /// Folders whose own names are durable.
+    /// Folders whose names are durable.
     durable_folders: HashSet<String>,
     n_temporary: u64,
     /// Opened files, most recently used last.
@@ -61,8 +66,8 @@ struct State {
     cache_bytes: usize,
 }
 
-/// The row of a file that was put, for the caller to commit. Nobody removes the file while this is there: it is to be
-/// dropped after the commit.
+/// The row of a stored file, for the caller to commit. The file is not removed while this value
+/// exists; drop it after the commit.
 #[derive(Debug)]
 pub struct Kept {
     row: ObjectRow,
@@ -77,7 +82,7 @@ impl Deref for Kept {
     }
 }
 
-/// Keeps a file, named relative to the library, from being removed.
+/// Protects a file, named relative to the library, from removal.
 struct Hold {
     file: String,
     state: Arc<Mutex<State>>,
@@ -97,7 +102,7 @@ impl Drop for Hold {
             Some(n) if *n > 1 => *n -= 1,
             _ => {
                 state.held.remove(&self.file);
-                // If it was committed, the catalog says so when it is to be removed.
+                // If the file was committed, the catalog shows it at the time of removal.
                 state.let_go.insert(self.file.clone(), Instant::now());
             }
         }
@@ -105,7 +110,8 @@ impl Drop for Hold {
 }
 
 fn locked(state: &Mutex<State>) -> MutexGuard<'_, State> {
-    // Every change of the state is complete in itself, so a panic elsewhere left it whole.
+    // Every change of the state is complete in itself, so a panic elsewhere left the state
+    // consistent.
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -126,7 +132,7 @@ impl ObjectKind {
 }
 
 impl Objects {
-    /// Opens the files below `root`, which must exist; its folders are created.
+    /// Opens the files below `root`, which must exist; creates the folders.
     pub fn open(disk: Arc<dyn Disk>, root: &Path, health: Health) -> Result<Self, StoreError> {
         let objects = Self {
             disk,
@@ -182,7 +188,7 @@ impl Objects {
         })
     }
 
-    /// The description a row names: mapped, its length and BLAKE3 checked once per opening.
+    /// The description of a row: mapped, with its length and BLAKE3 checked once after opening.
     pub fn open_description(&self, row: &ObjectRow) -> Result<MappedDescription, StoreError> {
         if let Some(mapped) = self.cached(&row.file, row.blake3) {
             return Ok(mapped);
@@ -196,24 +202,24 @@ impl Objects {
         Ok(mapped)
     }
 
-    /// The bytes a row names, as they were put.
+    /// The original bytes of a row.
     pub fn original(&self, row: &ObjectRow) -> Result<Vec<u8>, StoreError> {
         read_original(&*self.disk, &self.root, row)
     }
 
-    /// Bounds the bytes that stay mapped between uses; 0 keeps nothing mapped.
+    /// Limits the bytes that stay mapped between uses; 0 keeps no unused mapping.
     pub fn set_cache_bytes(&self, bytes: usize) {
         let mut state = self.state();
         state.cache_bytes = bytes;
         state.trim_cache();
     }
 
-    /// Keeps nothing mapped that is not in use.
+    /// Drops all unused mappings.
     pub fn unmap(&self) {
         self.state().cache.clear();
     }
 
-    /// Notes that the rows of these files, named relative to the library, are gone.
+    /// Records that the rows of these files, named relative to the library, were deleted.
     pub(super) fn let_go(&self, files: impl IntoIterator<Item = String>) {
         let now = Instant::now();
         self.state()
@@ -221,12 +227,12 @@ impl Objects {
             .extend(files.into_iter().map(|file| (file, now)));
     }
 
-    /// Notes that a file which was let go is named by a row after all.
+    /// Records that a row names a released file again.
     pub(super) fn still_needed(&self, file: &str) {
         self.state().let_go.remove(file);
     }
 
-    /// Files that were let go so long ago, and that nobody has held since.
+    /// Files that were released at least `min_age` ago and have not been held since.
     pub(super) fn let_go_since(&self, min_age: Duration) -> Vec<String> {
         let state = self.state();
         let old = state.let_go.iter().filter(|(file, since)| {
@@ -235,15 +241,16 @@ impl Objects {
         old.map(|(file, _)| file.clone()).collect()
     }
 
-    /// Removes a file that is neither catalogued nor held; whether it did.
+    /// Removes a file that is neither catalogued nor held; returns whether it did.
     pub(super) fn remove(
         &self,
         file: &str,
         catalogued: impl Fn(&str) -> Result<bool, StoreError>,
     ) -> Result<bool, StoreError> {
         self.health.writable()?;
-        // Held until the file is gone: a put of the same name announces itself first, and keeps its hold until its row is
-        // committed. So whoever is to name the file is seen here, or in the catalog.
+        // The state stays locked until the file is gone: a writer of the same name announces itself
+        // first, and keeps its hold until its row is committed. So every writer that is about to
+        // name the file is visible here, or in the catalog.
         let mut state = self.state();
         if state.held.contains_key(file) {
             return Ok(false);
@@ -259,13 +266,13 @@ impl Objects {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(false),
             Err(e) => return Err(StoreError::io(&path, e)),
         }
-        // Mapped, it would take up its space.
+        // A mapping would keep its space in use.
         state.cache.retain(|(mapped, ..)| mapped != file);
         Ok(true)
     }
 
-    /// Removes files that are neither catalogued, nor held, nor younger than `min_age`, and returns their
-    /// names. What this process let go is aged by the monotonic clock.
+    /// Removes files that are neither catalogued, nor held, nor younger than `min_age`, and returns
+    /// their names. The age of files that this process released is measured by the monotonic clock.
     pub(super) fn sweep(
         &self,
         min_age: Duration,
@@ -281,7 +288,7 @@ impl Objects {
                 .map_err(|e| StoreError::io(&path, e))?
             {
                 let file = relative(&self.root, &entry.path);
-                // A time in the future is no age at all.
+                // A time in the future counts as no age.
                 let by_clock = entry.modified.elapsed().is_ok_and(|age| age >= min_age);
                 let old = match self.state().let_go.get(&file) {
                     Some(since) => since.elapsed() >= min_age,
@@ -326,7 +333,7 @@ impl Objects {
             let hold = self.hold(&file);
             let path = self.root.join(&file);
             match self.disk.read(&path) {
-                // Durable: it was synced before it got this name, and the name was there when
+                // It is durable: it was synced before it got this name, and the name existed when
                 // `make_folder` synced the folder, or was published since.
                 Ok(stored) if same(&stored) => {
                     let (length, blake3) = (stored.len() as u64, Digest::of(&stored));
@@ -339,7 +346,8 @@ impl Objects {
                     };
                     return Ok(Kept { row, _hold: hold });
                 }
-                // Other bytes: either damaged, or written by another version and named by a row.
+                // The bytes differ: either they are damaged, or another version wrote them and a
+                // row names them.
                 Ok(_) => continue,
                 Err(e) if e.kind() == io::ErrorKind::InvalidData => continue,
                 Err(e) if e.kind() == io::ErrorKind::NotFound => {}
@@ -361,8 +369,8 @@ impl Objects {
         ))
     }
 
-    /// Makes the folder of a two-digit prefix. Once per process both its own name and the names in
-    /// it are synced: an earlier process may have ended between a rename and its sync.
+    /// Creates the folder of a two-digit prefix. Once for each process both its name and the names
+    /// in it are synced: an earlier process may have ended between a rename and its sync.
     fn make_folder(&self, parent: &str, folder: &str) -> Result<(), StoreError> {
         if self.state().durable_folders.contains(folder) {
             return Ok(());
@@ -378,8 +386,8 @@ impl Objects {
             false => self.disk.sync_dir(&path),
         });
         if let Err(e) = synced {
-            // Once the folder is gone again, the next attempt starts from the beginning; a folder
-            // that was there before cannot be taken back.
+            // The folder is removed, so that the next attempt starts from the beginning; a folder
+            // that existed before cannot be removed.
             return Err(
                 if created && is_no_space(&e) && self.disk.remove_dir(&path).is_ok() {
                     StoreError::io(&parent, e)
@@ -392,7 +400,7 @@ impl Objects {
         Ok(())
     }
 
-    /// Temporary file, sync, rename, sync of the folder.
+    /// Writes a temporary file, syncs it, renames it, and syncs the folder.
     fn publish(&self, folder: &Path, path: &Path, pieces: &[&[u8]]) -> Result<(), StoreError> {
         let (temporary, _hold) = self.temporary();
         let written = self.write_synced(&temporary, pieces).and_then(|()| {
@@ -407,7 +415,7 @@ impl Objects {
         }
         match self.disk.sync_dir(folder) {
             Ok(()) => Ok(()),
-            // Taken back, so that no later call finds a name whose sync failed.
+            // The name is taken back, so that no later call finds a name whose sync failed.
             Err(e) if is_no_space(&e) && self.disk.remove(path).is_ok() => {
                 Err(StoreError::io(folder, e))
             }
@@ -426,8 +434,8 @@ impl Objects {
         file.sync().map_err(|e| self.sync_failed(path, &e))
     }
 
-    /// A full disk passes: the file is thrown away, and the next attempt writes a new one. Any
-    /// other failed sync is the end of writing.
+    /// A full disk is temporary: the file is removed, and the next attempt writes a new one. After
+    /// any other failed sync the store refuses writes.
     fn sync_failed(&self, path: &Path, error: &io::Error) -> StoreError {
         let path = path.display().to_string();
         if is_no_space(error) {
@@ -437,7 +445,7 @@ impl Objects {
         }
     }
 
-    /// A path for a new temporary file, and what keeps it from being swept.
+    /// A path for a new temporary file, with the hold that protects it from sweeps.
     fn temporary(&self) -> (PathBuf, Hold) {
         loop {
             let n = {
@@ -448,7 +456,7 @@ impl Objects {
             let name = format!("{TEMPORARY}/{}-{n}", std::process::id());
             let path = self.root.join(&name);
             let hold = self.hold(&name);
-            // An earlier process with the same id may have left one behind.
+            // An earlier process with the same id may have left a file behind.
             if !self.disk.exists(&path) {
                 return (path, hold);
             }
@@ -485,7 +493,7 @@ impl State {
     }
 }
 
-/// Maps the array file of a row; a file that is missing or wrong is damage.
+/// Maps the array file of a row; a missing or wrong file is damage.
 pub(super) fn map_description(
     root: &Path,
     row: &ObjectRow,
@@ -498,7 +506,7 @@ pub(super) fn map_description(
     }
 }
 
-/// Reads the original of a row; a file that is missing or wrong is damage.
+/// Reads the original of a row; a missing or wrong file is damage.
 pub(super) fn read_original(
     disk: &dyn Disk,
     root: &Path,
@@ -536,7 +544,7 @@ pub(super) fn read_original(
     Ok(bytes)
 }
 
-/// The name of a file below the library's folder, as the catalog has it.
+/// The name of a file relative to the library's folder, as in the catalog.
 pub(super) fn relative(root: &Path, path: &Path) -> String {
     path.strip_prefix(root)
         .unwrap_or(path)
@@ -544,7 +552,7 @@ pub(super) fn relative(root: &Path, path: &Path) -> String {
         .to_string()
 }
 
-/// Whether `stored` is what the pieces make.
+/// Whether `stored` equals the joined pieces.
 fn holds(mut stored: &[u8], pieces: &[&[u8]]) -> bool {
     let all = pieces.iter().all(|piece| {
         let rest = stored.strip_prefix(*piece);

@@ -1,4 +1,4 @@
-//! What is damaged is put aside, never deleted: files, and the catalog as it was before it was mended.
+//! Moves damaged data aside instead of deleting it: files, and the catalog before its repair.
 
 use super::catalog::witness::{self, Found, Shortfall, Witness};
 use super::catalog::{self, log, schema};
@@ -9,14 +9,14 @@ use rusqlite::Connection;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The folder in a library for what was put aside.
+/// The folder in a library for data that was moved aside.
 pub const QUARANTINE: &str = "quarantine";
 
-/// Rebuilds the indexes of a catalog whose structure is damaged, after putting a copy of it aside; true if it
-/// was, and all is well now. No process may hold the library.
+/// Rebuilds the indexes of a catalog with a damaged structure, after copying it to the quarantine.
+/// Returns true if the structure was damaged and is now intact. No process may hold the library.
 ///
 /// # Errors
-/// The library is held, or the catalog is damaged in more than its indexes.
+/// If the library is held, or the damage is not limited to indexes.
 pub fn rebuild_indexes(dir: &Path) -> Result<bool, StoreError> {
     let _lock = LibraryLock::acquire(dir)?;
     let path = catalog::path_in(dir);
@@ -32,7 +32,7 @@ pub fn rebuild_indexes(dir: &Path) -> Result<bool, StoreError> {
     if integrity(&connection).is_ok_and(|found| found == "ok") {
         return Ok(false);
     }
-    // Into one file, so that the copy has all of it.
+    // A checkpoint into one file makes the copy complete.
     connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
     keep_catalog(dir)?;
     connection.execute_batch("REINDEX")?;
@@ -46,11 +46,12 @@ pub fn rebuild_indexes(dir: &Path) -> Result<bool, StoreError> {
     })
 }
 
-/// Goes on with what there is of a catalog that lacks changes it once held, because its log is damaged, missing, cut or of
-/// another time; what was there before is put aside. What was lost, in words, or nothing. No process may hold the library.
+/// Accepts the present state of a catalog that lacks changes because its log is damaged, missing,
+/// cut or of another time; the previous files are moved aside. Returns a description of the loss,
+/// if any. No process may hold the library.
 ///
 /// # Errors
-/// The library is held, or there is no catalog of it to go on with.
+/// If the library is held, or has no catalog to continue with.
 pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
     let _lock = LibraryLock::acquire(dir)?;
     let path = catalog::path_in(dir);
@@ -92,7 +93,7 @@ pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
         return Err(refused());
     }
     drop(connection);
-    // What is left of the log, into the file.
+    // Copies the rest of the log into the file.
     let connection = Connection::open(&path)?;
     connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |_| Ok(()))?;
     drop(connection);
@@ -108,7 +109,7 @@ pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
     )))
 }
 
-/// Copies the catalog and its log into the quarantine; where the copy is.
+/// Copies the catalog and its log into the quarantine; returns the path of the copy.
 fn keep_catalog(dir: &Path) -> Result<PathBuf, StoreError> {
     let path = catalog::path_in(dir);
     let kept = dir.join(QUARANTINE);
@@ -135,10 +136,11 @@ fn keep_catalog(dir: &Path) -> Result<PathBuf, StoreError> {
 }
 
 impl Store {
-    /// Moves a file, named relative to the library, into the quarantine; nothing if it is missing.
+    /// Moves a file, named relative to the library, into the quarantine; does nothing if it is
+    /// missing.
     ///
     /// # Errors
-    /// The file cannot be moved.
+    /// If the file cannot be moved.
     pub fn put_aside(&self, file: &str) -> Result<(), StoreError> {
         let from = self.dir().join(file);
         if !from.exists() {

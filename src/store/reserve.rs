@@ -1,7 +1,7 @@
-//! Room on the disk that is kept for changes that free room.
+//! Reserves space on the disk for changes that free space.
 //!
-//! Even a removal writes: its rows go to the log before anything is given back. On a full disk a file
-//! that holds a few megabytes and nothing else is removed for it, and made anew when there is room.
+//! Even a removal writes: its rows go to the log before any space is freed. A reserve file of a few
+//! megabytes is removed for it on a full disk, and created again when there is room.
 
 use super::StoreError;
 use super::error::is_no_space;
@@ -10,16 +10,17 @@ use std::fs::File;
 use std::io::{self, Write as _};
 use std::path::Path;
 
-/// The file, in the library's folder.
+/// The reserve file in the library's folder.
 const RESERVE_FILE: &str = "reserve";
 
-/// Its length: a removal writes a few hundred kilobytes, and the log is emptied when it has 4 MiB.
+/// Its size: a removal writes a few hundred kilobytes, and the log is emptied at 4 MiB.
 const BYTES: u64 = 4 << 20;
 
-/// It is made anew only where as many times its length are free, so that it does not take what was just freed.
+/// It is created again only if this multiple of its size is free, so that it does not take the
+/// space that was just freed.
 const MIN_FREE: u64 = 4;
 
-/// Gives up the room; false if there was none.
+/// Removes the reserve; returns false if there was none.
 pub(super) fn give_up(library: &Path) -> bool {
     match std::fs::remove_file(library.join(RESERVE_FILE)) {
         Ok(()) => {
@@ -30,7 +31,8 @@ pub(super) fn give_up(library: &Path) -> bool {
     }
 }
 
-/// Keeps the room if it is not kept and there is enough. Without it all goes on, but for removals on a full disk.
+/// Creates the reserve if it is missing and there is enough room. Without it everything works
+/// except removals on a full disk.
 pub(super) fn keep(library: &Path) {
     match try_keep(library) {
         Ok(()) => {}
@@ -53,7 +55,7 @@ fn try_keep(library: &Path) -> io::Result<()> {
     if disk.f_bavail.saturating_mul(disk.f_frsize) < MIN_FREE * BYTES {
         return Ok(());
     }
-    // Short, if a process ended while it was made.
+    // The file is too short if a process ended while it created it.
     match std::fs::remove_file(&path) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
         _ => {}
@@ -61,7 +63,7 @@ fn try_keep(library: &Path) -> io::Result<()> {
     let mut file = File::options().write(true).create_new(true).open(&path)?;
     let made = match fallocate(&file, FallocateFlags::empty(), 0, BYTES) {
         Ok(()) => Ok(()),
-        // Not every file system can: there the bytes are written.
+        // Some file systems do not support this; the bytes are then written.
         Err(rustix::io::Errno::OPNOTSUPP) => {
             let block = [0; 1 << 16];
             (0..BYTES / block.len() as u64).try_for_each(|_| file.write_all(&block))

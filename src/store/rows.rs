@@ -1,13 +1,14 @@
-//! The catalog's rows as plain values. Text and bytes that only the library understands stay opaque.
+//! Represents the catalog's rows as plain values. Text and bytes that only the library interprets
+//! are opaque.
 
 use super::Digest;
 use rusqlite::types::{FromSql, FromSqlError, FromSqlResult, ToSql, ToSqlOutput, ValueRef};
 
-/// A collection, by its row; never used again after it is deleted.
+/// The row id of a collection; never reused after the collection is deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct CollectionId(pub i64);
 
-/// A shape, by its row; never used again after it is deleted.
+/// The row id of a shape; never reused after the shape is deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ShapeId(pub i64);
 
@@ -18,13 +19,13 @@ pub struct NewCollection {
     pub name: String,
     /// Number of part kinds; `None`: estimated.
     pub n_parts: Option<u32>,
-    /// Which way is up, as the library writes it.
+    /// The up axis, in the library's format.
     pub up: String,
-    /// Which Laplacian, as the library writes it.
+    /// The Laplacian, in the library's format.
     pub operator: String,
-    /// Faces of the proxies.
+    /// Number of faces of the proxies.
     pub working_faces: u32,
-    /// Whatever the library keeps with the collection.
+    /// The library's opaque state of the collection.
     pub state: Vec<u8>,
 }
 
@@ -37,11 +38,11 @@ pub struct CollectionRow {
     pub name: String,
     /// Number of part kinds; `None`: estimated.
     pub n_parts: Option<u32>,
-    /// Which way is up, as the library writes it.
+    /// The up axis, in the library's format.
     pub up: String,
-    /// Which Laplacian, as the library writes it.
+    /// The Laplacian, in the library's format.
     pub operator: String,
-    /// Faces of the proxies.
+    /// Number of faces of the proxies.
     pub working_faces: u32,
     /// Sequence number of its newest event; 0 before the first under this name.
     pub sequence: u64,
@@ -51,11 +52,11 @@ pub struct CollectionRow {
     pub next_label: u32,
     /// Generation of its labels.
     pub epoch: u64,
-    /// Whatever the library keeps with the collection.
+    /// The library's opaque state of the collection.
     pub state: Vec<u8>,
 }
 
-/// What an object file holds.
+/// The kinds of object files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum ObjectKind {
     /// The arrays of a description.
@@ -64,16 +65,16 @@ pub enum ObjectKind {
     Original,
 }
 
-/// An object file that counts: this row is its commit marker.
+/// A committed object file: this row is its commit marker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ObjectRow {
-    /// What it holds.
+    /// Its kind.
     pub kind: ObjectKind,
     /// Digest of the description (see [`Digest::of_description`]) or of the original bytes.
     pub digest: Digest,
     /// Its path below the library's folder.
     pub file: String,
-    /// Bytes in the file.
+    /// Size of the file in bytes.
     pub length: u64,
     /// BLAKE3 of the file's bytes.
     pub blake3: Digest,
@@ -82,7 +83,7 @@ pub struct ObjectRow {
 /// A new shape. Its labels follow in the same transaction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewShapeRow {
-    /// Which collection.
+    /// Its collection.
     pub collection: CollectionId,
     /// Unique in the collection.
     pub name: String,
@@ -90,17 +91,17 @@ pub struct NewShapeRow {
     pub ordinal: u64,
     /// BLAKE3 of the original bytes; its object must be catalogued.
     pub content_digest: Digest,
-    /// Format of the original bytes, as the library writes it.
+    /// Format of the original bytes, in the library's notation.
     pub format: String,
     /// Digest of the description; its object must be catalogued.
     pub description_digest: Digest,
-    /// Polygons of the input.
+    /// Number of polygons of the input.
     pub n_polygons: u64,
     /// Area in squared input units.
     pub area: f64,
-    /// What cleaning found and did.
+    /// The findings and actions of cleaning.
     pub report_json: String,
-    /// Version its labels go on from: 0, or more if it replaces a shape.
+    /// The version that its labels continue from: 0, or more if it replaces a shape.
     pub version: u64,
     /// Global descriptor by which neighbours are ranked.
     pub signature: Vec<f32>,
@@ -113,7 +114,7 @@ pub struct NewShapeRow {
 pub struct ShapeRow {
     /// Its id.
     pub id: ShapeId,
-    /// Which collection.
+    /// Its collection.
     pub collection: CollectionId,
     /// Unique in the collection.
     pub name: String,
@@ -121,25 +122,25 @@ pub struct ShapeRow {
     pub ordinal: u64,
     /// BLAKE3 of the original bytes.
     pub content_digest: Digest,
-    /// Format of the original bytes, as the library writes it.
+    /// Format of the original bytes, in the library's notation.
     pub format: String,
     /// Digest of the description.
     pub description_digest: Digest,
-    /// Polygons of the input.
+    /// Number of polygons of the input.
     pub n_polygons: u64,
     /// Area in squared input units.
     pub area: f64,
-    /// What cleaning found and did.
+    /// The findings and actions of cleaning.
     pub report_json: String,
     /// Version of its newest labels.
     pub version: u64,
     /// Epoch of the collection for which its labels were computed.
     pub label_epoch: u64,
-    /// Whether its labels wait to be recomputed.
+    /// Whether its labels are stale and wait to be recomputed.
     pub stale: bool,
-    /// Its parts, as the library writes them.
+    /// Its parts, in the library's format.
     pub parts_json: String,
-    /// The shapes its labels were carried from, as the library writes them.
+    /// The shapes from which its labels were propagated, in the library's format.
     pub sources_json: String,
     /// Bytes of its array file and of its compressed original.
     pub stored_bytes: u64,
@@ -163,11 +164,11 @@ pub struct DescriptionRef {
 /// One version of the labels of a shape.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct LabelVersionRow {
-    /// From 1; each is the one before plus 1.
+    /// The version, from 1; versions are consecutive.
     pub version: u64,
     /// Sequence number of the event that announced it.
     pub sequence: u64,
-    /// The rule that made it.
+    /// The rule that caused it.
     pub cause: String,
     /// Label of each proxy face `(m,)`; -1 is unlabelled.
     pub proxy_labels: Vec<i32>,
@@ -178,29 +179,29 @@ pub struct LabelVersionRow {
     pub polygon_labels: Vec<i32>,
     /// Probability of the label of each input polygon `(n_polygons,)`, see [`confidence_to_u8`].
     pub polygon_confidence: Vec<u8>,
-    /// The shapes the labels were carried from, as the library writes them.
+    /// The shapes from which the labels were propagated, in the library's format.
     pub sources_json: String,
 }
 
-/// What a shape's row says of its newest labels.
+/// The summary of a shape's newest labels in its row.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct LabelSummary {
     /// Epoch of the collection for which the labels were computed.
     pub label_epoch: u64,
-    /// The parts, as the library writes them.
+    /// The parts, in the library's format.
     pub parts_json: String,
-    /// Each label the shape carries, with its share of the area.
+    /// Each label of the shape, with its share of the area.
     pub area_shares: Vec<(u32, f64)>,
 }
 
-/// A probability from 0 to 1 in steps of 1/255, the resolution that is stored; others are clamped,
-/// and what is not a number counts as 0.
+/// Converts a probability from 0 to 1 to steps of 1/255, the stored resolution; values outside are
+/// clamped, and NaN counts as 0.
 pub fn confidence_to_u8(probability: f32) -> u8 {
-    // A cast from float saturates and takes NaN to 0.
+    // A cast from float saturates and converts NaN to 0.
     (probability * 255.0).round() as u8
 }
 
-/// The probability that [`confidence_to_u8`] stored.
+/// Converts a probability stored by [`confidence_to_u8`] back.
 pub fn confidence_from_u8(stored: u8) -> f32 {
     f32::from(stored) / 255.0
 }
@@ -208,46 +209,47 @@ pub fn confidence_from_u8(stored: u8) -> f32 {
 /// A label of a collection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LabelRow {
-    /// Its id.
+    /// Its name, if a person gave one.
     pub id: u32,
     /// A name a person gave.
     pub name: Option<String>,
     /// sRGB colour.
     pub colour: [u8; 3],
-    /// The label this one was merged into.
+    /// The label that it was merged into.
     pub merged_into: Option<u32>,
 }
 
-/// Something a person changed in a collection, as long as it can be undone.
+/// A change of a collection by a person, as long as it can be undone.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CorrectionRow {
-    /// Its id, growing in the order of the changes.
+    /// Its id; ids grow in the order of the changes.
     pub id: i64,
-    /// What kind of change, as the library writes it.
+    /// The kind of change, in the library's notation.
     pub kind: String,
-    /// What was changed, as the library writes it.
+    /// The details of the change, in the library's format.
     pub detail_json: String,
-    /// What the library needs to undo it.
+    /// The data that the library needs to undo it.
     pub before: Vec<u8>,
 }
 
 /// The newest labels a shape had before a correction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelsBefore {
-    /// Which shape.
+    /// The shape.
     pub shape: ShapeId,
-    /// Version of its labels then; it stays readable as long as the correction can be undone.
+    /// Version of its labels at that time; it stays readable as long as the correction can be
+    /// undone.
     pub version: u64,
-    /// What its row said of them.
+    /// The summary of these labels in the shape's row.
     pub summary: LabelSummary,
 }
 
-/// A functional map that is kept.
+/// A stored functional map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapRow {
-    /// Functions on this shape are carried
+    /// The shape whose functions are transferred.
     pub from: ShapeId,
-    /// to this one.
+    /// The shape that receives them.
     pub to: ShapeId,
     /// Columns of `c_12`.
     pub k1: u32,
@@ -257,14 +259,14 @@ pub struct MapRow {
     pub c_12: Vec<f32>,
     /// `p2p_21 (n2,)`: for each proxy vertex of `to` a proxy vertex of `from`.
     pub p2p_21: Vec<u32>,
-    /// What to expect of it at each proxy vertex of `to`, as the library writes it; empty in a map that was kept before that
-    /// was known.
+    /// Its confidence at each proxy vertex of `to`, in the library's format; empty in a map that
+    /// was stored before format 3.
     pub confidence: Vec<u8>,
-    /// How good it is, as the library writes it.
+    /// Its quality, in the library's format.
     pub quality_json: String,
 }
 
-/// A map between points that is kept.
+/// A stored map between points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PointMapRow {
     /// Rows and columns of `c_12`.
@@ -273,9 +275,9 @@ pub struct PointMapRow {
     pub c_12: Vec<f32>,
     /// `p2p_21 (n2,)`: for each proxy vertex of the second shape a proxy vertex of the first.
     pub p2p_21: Vec<u32>,
-    /// For each proxy vertex of the second shape 1 if something corresponds to it, else 0.
+    /// For each proxy vertex of the second shape 1 if it has a counterpart, else 0.
     pub matched: Vec<u8>,
-    /// How good it is, as the library writes it.
+    /// Its quality, in the library's format.
     pub detail_json: String,
 }
 
@@ -286,7 +288,7 @@ pub struct JobRow {
     pub id: u64,
     /// Name of the collection.
     pub collection: String,
-    /// When it was accepted, in seconds since 1970.
+    /// The time of acceptance, in seconds since 1970.
     pub created_unix_secs: u64,
 }
 
@@ -297,20 +299,20 @@ pub struct NewJobItem {
     pub name: String,
     /// BLAKE3 of the original bytes; their object must be catalogued.
     pub original_digest: Digest,
-    /// Format of the original bytes, as the library writes it.
+    /// Format of the original bytes, in the library's notation.
     pub format: String,
-    /// Whether other bytes under the same name are replaced.
+    /// Whether the shape replaces one of the same name with other bytes.
     pub replace: bool,
 }
 
-/// How far a shape of a job is.
+/// The status of a shape of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ItemStatus {
-    /// Not done; taken up again after a restart.
+    /// Unfinished; resumed after a restart.
     Queued,
     /// Labelled and durable.
     Done,
-    /// Refused.
+    /// Failed or refused.
     Failed,
     /// Cancelled before it was placed.
     Cancelled,
@@ -319,60 +321,61 @@ pub enum ItemStatus {
 /// A shape of a job.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct JobItemRow {
-    /// Which job.
+    /// Its job.
     pub job: u64,
     /// Position in the job, from 0.
     pub index: u32,
     /// Name of the job's collection.
     pub collection: String,
-    /// As it was accepted.
+    /// The accepted shape.
     pub item: NewJobItem,
-    /// How far it is.
+    /// Its status.
     pub status: ItemStatus,
-    /// What became of it, as the library writes it.
+    /// Its result, in the library's format.
     pub detail_json: Option<String>,
 }
 
-/// A request that was answered: its effect is durable exactly if this row is.
+/// An answered request: its effect is durable if and only if this row exists.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RequestRow {
-    /// Who asked.
+    /// The client.
     pub client_id: String,
-    /// Which request of theirs.
+    /// The client's id of the request.
     pub request_id: String,
-    /// Digest of the request, to tell a repeat from another request under the same id.
+    /// Digest of the request, which distinguishes a repetition from another request with the same
+    /// id.
     pub request_digest: Digest,
-    /// The reply, as it was sent.
+    /// The reply in its original bytes.
     pub reply: Vec<u8>,
-    /// When it was answered, in seconds since 1970.
+    /// The time of the answer, in seconds since 1970.
     pub created_unix_secs: u64,
 }
 
-/// Something that happened under a collection's name.
+/// An event under a collection's name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventRow {
     /// Position in the log of the name, from 1, without gaps.
     pub sequence: u64,
-    /// What happened, for people who look into the catalog.
+    /// The kind of event, for people who examine the catalog.
     pub kind: String,
-    /// The event, as the library writes it.
+    /// The event, in the library's format.
     pub payload_json: String,
 }
 
 /// Counters over the whole catalog.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Totals {
-    /// Collections.
+    /// Number of collections.
     pub n_collections: u64,
-    /// Shapes.
+    /// Number of shapes.
     pub n_shapes: u64,
-    /// Shapes whose labels wait to be recomputed.
+    /// Number of stale shapes.
     pub n_stale: u64,
-    /// Job items not yet done.
+    /// Number of unfinished job items.
     pub n_queued: u64,
-    /// Bytes of all catalogued object files.
+    /// Size of all catalogued object files in bytes.
     pub object_bytes: u64,
-    /// Bytes of the catalog itself.
+    /// Size of the catalog itself in bytes.
     pub catalog_bytes: u64,
 }
 

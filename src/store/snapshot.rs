@@ -1,8 +1,9 @@
-//! A library becomes a copy of itself as of one moment, also while it is in use.
+//! Copies a library at one moment, even while it is in use.
 //!
-//! The catalog is copied in one read transaction, then the files that the copy names: they are immutable, and
-//! none that the library lets go meanwhile is removed before the copy has it. The copy is complete under its name, or not
-//! there; what a process leaves that is killed is taken over by the next copy of that name.
+//! The catalog is copied in one read transaction, then the files that the copy names. Files are
+//! immutable, and those that the library releases meanwhile are not removed before they are copied.
+//! The copy either exists completely under its name or not at all; the remains of an interrupted
+//! copy are reused by the next copy of that name.
 
 use super::catalog::witness::{self, Witness};
 use super::catalog::{self, Reader};
@@ -16,23 +17,25 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// What was copied.
+/// The result of copying.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
-    /// Object files.
+    /// Number of object files.
     pub n_files: u64,
-    /// Bytes of all files.
+    /// Size of all files in bytes.
     pub n_bytes: u64,
-    /// What a check of the copy found; damage of the library is in its copy too.
+    /// The findings of a check of the copy; it contains the damage of the library, too.
     pub findings: Vec<Finding>,
 }
 
-/// Copies the library in `from` to `to`, which must be missing or an empty folder, and verifies the copy. With
-/// `link` object files become hard links where that is possible: at once, without space, and damaged together.
+/// Copies the library in `from` to `to`, which must be missing or an empty folder, and verifies the
+/// copy. With `link` object files become hard links where possible, which is fast and takes no
+/// space, but damage affects both.
 ///
 /// # Errors
-/// There is no library, its catalog cannot be read, or the copy cannot be written; then nothing is left behind
-/// but a folder named `to` with `.partial`, if even that cannot be removed, for the next copy to take over.
+/// If there is no library, its catalog cannot be read, or the copy cannot be written. Nothing is
+/// left behind then, except a folder named `to` with `.partial` if it cannot be removed; the next
+/// copy reuses it.
 pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> {
     let at = |path: &Path| {
         let path = path.to_path_buf();
@@ -52,7 +55,7 @@ pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> 
     partial.push(".partial");
     let partial = PathBuf::from(partial);
     let _alone = take_over(&partial)?;
-    // From before the catalog is read until all files are there.
+    // Held from before the catalog is read until all files are copied.
     let _reading = Reading::begin(from)?;
     let copied = copy_into(from, &partial, link).and_then(|counts| {
         fs::rename(&partial, to).map_err(at(to))?;
@@ -75,8 +78,7 @@ pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot, StoreError> 
     })
 }
 
-/// Makes the folder that a copy is written into, or empties the one that a copy left whose process ended; and keeps others
-/// from it.
+/// Creates the folder for a copy, or empties that of an interrupted copy, and locks it.
 fn take_over(partial: &Path) -> Result<Locked, StoreError> {
     let at = |e| StoreError::io(partial, e);
     let refuse = |text: &str| {
@@ -152,7 +154,7 @@ fn copy_into(from: &Path, to: &Path, link: bool) -> Result<(u64, u64), StoreErro
         if !linked {
             match fs::copy(&source, &target) {
                 Ok(_) => sync(&target)?,
-                // The check names it.
+                // The check reports the missing file.
                 Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
                 Err(e) => return Err(StoreError::io(&target, e)),
             }

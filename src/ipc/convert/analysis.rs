@@ -1,4 +1,4 @@
-//! Arrays of descriptions, maps between shapes.
+//! Converts arrays of descriptions, and maps between shapes.
 
 use super::errors::{field_error, frame_error};
 use crate::fmap::consistency::Standing;
@@ -8,7 +8,7 @@ use crate::ipc::wire::{self, ErrorReason};
 use crate::library::{MapInfo, PartMatch, PointRequest, PolygonValues};
 use crate::pipeline::DescriptionView;
 
-/// Eigenvalues, and eigenvectors with the mass if they are wanted; `area` in squared input units.
+/// Eigenvalues, optionally with eigenvectors and mass; `area` is in squared input units.
 pub fn spectrum(
     d: &DescriptionView<'_>,
     area: f64,
@@ -33,7 +33,7 @@ pub fn hks(d: &DescriptionView<'_>, frames: &mut FrameWriter) -> wire::GetHksRep
     }
 }
 
-/// The proxy and what was computed on it.
+/// The proxy and its descriptors.
 pub fn descriptors(d: &DescriptionView<'_>, frames: &mut FrameWriter) -> wire::GetDescriptorsReply {
     let (n, m, polygons) = (d.vertices.len(), d.faces.len(), d.face_map.len());
     wire::GetDescriptorsReply {
@@ -76,13 +76,13 @@ fn part_quality(q: &Quality) -> wire::MapQuality {
     }
 }
 
-/// 1 where something corresponds, else 0.
+/// 1 for each vertex with a counterpart, else 0.
 fn matched(matched: impl Iterator<Item = bool>, frames: &mut FrameWriter) -> wire::ArrayRef {
     let flags: Vec<u32> = matched.map(u32::from).collect();
     frames.u32_array(&flags, &[flags.len()])
 }
 
-/// What is asked of a map between points.
+/// The options of a request for a map between points.
 pub fn point_request(options: &wire::PointMapOptions) -> PointRequest {
     PointRequest {
         landmarks: options.landmarks.iter().map(|l| [l.from, l.to]).collect(),
@@ -96,7 +96,7 @@ pub fn point_request(options: &wire::PointMapOptions) -> PointRequest {
     }
 }
 
-/// A map between points and perhaps its alternative.
+/// A map between points, and its alternative if there is one.
 pub fn point_maps(maps: &[PointMap], frames: &mut FrameWriter) -> wire::GetFunctionalMapReply {
     let mut reply = wire::GetFunctionalMapReply::default();
     if let Some(map) = maps.first() {
@@ -142,7 +142,7 @@ pub fn polygon_values(
     }
 }
 
-/// Values that were carried.
+/// Transferred values.
 pub fn transferred(
     values: &PolygonValues,
     map: &PointMap,
@@ -174,13 +174,13 @@ pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunct
     }
 }
 
-/// The same map, of a shape whose proxy has so many vertices.
+/// Adds the number of vertices of the source shape's proxy to a map.
 pub fn from_vertices(map: wire::GetFunctionalMapReply, n1: usize) -> wire::GetFunctionalMapReply {
     let n1 = u32::try_from(n1).unwrap_or(u32::MAX);
     wire::GetFunctionalMapReply { n1, ..map }
 }
 
-/// How a map agrees with the others of its collection.
+/// The agreement of a map with the others of its collection.
 pub fn agreement(standing: Standing) -> wire::MapAgreement {
     wire::MapAgreement {
         n_triangles: u32::try_from(standing.n_triangles).unwrap_or(u32::MAX),

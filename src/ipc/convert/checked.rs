@@ -1,17 +1,17 @@
-//! What a request says is checked before anything is done for it: values that this version does not
-//! know, frames that no field names, lists beyond their limits.
+//! Validates a request before any work for it starts: it rejects unknown enum values, frames that
+//! no field names, and lists beyond their limits.
 
 use super::errors::{error, field_error};
 use crate::ipc::wire::{
     self, ErrorCode, ErrorReason, correct_labels_request::Correction, request::Body, shape_input,
 };
 
-/// Landmarks of one map between points.
+/// Maximum number of landmarks of one map between points.
 pub const MAX_LANDMARKS: usize = 1_000;
-/// Shapes of one GetPortraits.
+/// Maximum number of shapes of one GetPortraits.
 pub const MAX_PORTRAITS: usize = 256;
 
-/// Refuses a request that came with so many raw frames and is wrong whatever the library has.
+/// Rejects a request with this number of raw frames if it is wrong regardless of the library.
 pub fn check_request(body: &Body, n_frames: usize) -> Result<(), wire::Error> {
     let mut frames = Named::default();
     match body {
@@ -23,7 +23,7 @@ pub fn check_request(body: &Body, n_frames: usize) -> Result<(), wire::Error> {
             for (i, shape) in r.shapes.iter().enumerate() {
                 match &shape.source {
                     Some(shape_input::Source::Encoded(mesh)) => {
-                        // Spelt out only where it is needed: there may be very many shapes.
+                        // The name is built only for an error, since there may be very many shapes.
                         if wire::MeshFormat::try_from(mesh.format).is_err() {
                             let field = format!("shapes[{i}].encoded.format");
                             known::<wire::MeshFormat>(mesh.format, &field)?;
@@ -85,7 +85,7 @@ pub fn check_request(body: &Body, n_frames: usize) -> Result<(), wire::Error> {
     frames.check(n_frames)
 }
 
-/// An enum value that this version knows.
+/// Rejects an enum value that this version does not know.
 fn known<T: TryFrom<i32>>(value: i32, field: &str) -> Result<(), wire::Error> {
     T::try_from(value).map(|_| ()).map_err(|_| {
         let text = format!("{field} is {value}, which this version does not know");
@@ -113,7 +113,7 @@ fn check_points(points: Option<&wire::PointMapOptions>) -> Result<(), wire::Erro
     at_most("points.landmarks", points.landmarks.len(), MAX_LANDMARKS)
 }
 
-/// Frames that fields name. What is named and was not sent is refused where it is read, with the
+/// Frames that fields name. A named frame that was not sent is rejected when it is read, with the
 /// field.
 #[derive(Default)]
 struct Named(Vec<u32>);

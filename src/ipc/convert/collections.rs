@@ -1,4 +1,4 @@
-//! Collections and labels.
+//! Converts collections and labels.
 
 use super::errors::field_error;
 use crate::ipc::wire;
@@ -18,7 +18,7 @@ fn up_to_wire(up: Up) -> wire::Up {
     }
 }
 
-/// Which way is up.
+/// The up axis.
 pub fn up_from_wire(up: wire::Up) -> Up {
     match up {
         wire::Up::PlusX => Up::PlusX,
@@ -45,13 +45,13 @@ fn unknown_value(field: &str, value: i32) -> wire::Error {
     field_error(wire::ErrorReason::FieldRange, field, text)
 }
 
-/// An up axis, if it is given.
+/// An up axis, if it is set.
 fn up_of(value: i32, field: &str) -> Result<Option<Up>, wire::Error> {
     let up = wire::Up::try_from(value).map_err(|_| unknown_value(field, value))?;
     Ok((up != wire::Up::Unspecified).then(|| up_from_wire(up)))
 }
 
-/// The up axis that a collection is to have.
+/// The new up axis of a collection.
 pub fn new_up(request: &wire::UpdateCollectionRequest) -> Result<Up, wire::Error> {
     let missing = || {
         let text = "up is missing; it is what can be changed";
@@ -60,7 +60,7 @@ pub fn new_up(request: &wire::UpdateCollectionRequest) -> Result<Up, wire::Error
     up_of(request.up, "up")?.ok_or_else(missing)
 }
 
-/// What became of a change of the up axis.
+/// The result of a change of the up axis.
 pub fn updated(done: &UpSet) -> wire::UpdateCollectionReply {
     wire::UpdateCollectionReply {
         changed: done.changed,
@@ -69,7 +69,7 @@ pub fn updated(done: &UpSet) -> wire::UpdateCollectionReply {
     }
 }
 
-/// What to create; fields that are not given take their defaults.
+/// The specification of a new collection; omitted fields take their defaults.
 pub fn collection_spec(
     spec: &wire::CollectionSpec,
     field: &str,
@@ -91,8 +91,8 @@ pub fn collection_spec(
     })
 }
 
-/// The first setting in which a wish, where it states one, differs from what is: its name, the wish and
-/// what is, for people.
+/// The first setting of a specification that is set and differs from the collection: its name, the
+/// requested value and the present one, as text.
 pub fn collection_differs(
     wish: &wire::CollectionSpec,
     is: &CollectionSpec,
@@ -126,7 +126,7 @@ pub fn collection_differs(
     None
 }
 
-/// As people write it: `+y`, `unknown`, `auto`.
+/// The name of an axis for people: `+y`, `unknown`, `auto`.
 fn up_name(up: wire::Up) -> &'static str {
     match up {
         wire::Up::PlusX => "+x",

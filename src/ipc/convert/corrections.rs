@@ -1,11 +1,11 @@
-//! What a person corrects.
+//! Converts corrections and their results.
 
 use super::errors::{field_error, frame_error};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::wire::{self, ErrorReason, correct_labels_request::Correction as Wire};
 use crate::library::{Corrected, Correction, Suggestion, Undone};
 
-/// What the request says of the shape.
+/// The labels of a shape in a request.
 pub fn correction(
     request: &wire::CorrectLabelsRequest,
     frames: FrameReader<'_>,
@@ -45,7 +45,7 @@ pub fn correction(
     }
 }
 
-/// What a correction did.
+/// The result of a correction.
 pub fn corrected(c: &Corrected) -> wire::CorrectLabelsReply {
     wire::CorrectLabelsReply {
         version: c.version,
@@ -58,7 +58,7 @@ pub fn corrected(c: &Corrected) -> wire::CorrectLabelsReply {
     }
 }
 
-/// What was undone.
+/// The result of an undo.
 pub fn undone(u: &Undone) -> wire::UndoReply {
     wire::UndoReply {
         change: u.change.clone(),
@@ -67,7 +67,7 @@ pub fn undone(u: &Undone) -> wire::UndoReply {
     }
 }
 
-/// Which shape to label next.
+/// The shape to label next.
 pub fn suggested(s: &Suggestion) -> wire::SuggestNextReply {
     wire::SuggestNextReply {
         shape: s.shape.clone(),

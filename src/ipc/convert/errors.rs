@@ -1,20 +1,20 @@
-//! Failures of the library and of decoding become wire errors.
+//! Converts failures of the library and of decoding to wire errors.
 
 use crate::ipc::frames::FrameError;
 use crate::ipc::wire::{Error, ErrorCode, ErrorReason, error::Subject};
 use crate::library::{Failure, FailureSubject, LibraryError};
 use crate::store::StoreError;
 
-/// Characters of an error's message.
+/// Maximum number of characters of an error's message.
 const MAX_MESSAGE_CHARS: usize = 2_000;
 
-/// Milliseconds after which a full disk is worth another try.
+/// Milliseconds after which a request may be retried on a full disk.
 const DISK_FULL_RETRY_MS: u64 = 10_000;
 
 /// An error without subject or retry delay.
 pub fn error(code: ErrorCode, reason: ErrorReason, message: impl Into<String>) -> Error {
     let mut message = message.into();
-    // A name that a client sent may be as long as its message.
+    // A name sent by a client may be as long as its message.
     if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE_CHARS) {
         message.truncate(end);
         message.push('…');
@@ -28,19 +28,19 @@ pub fn error(code: ErrorCode, reason: ErrorReason, message: impl Into<String>) -
     }
 }
 
-/// The same error, about `subject`.
+/// Adds `subject` to an error.
 pub fn with_subject(mut error: Error, subject: Subject) -> Error {
     error.subject = Some(subject);
     error
 }
 
-/// INVALID_ARGUMENT about one field of the request.
+/// The error INVALID_ARGUMENT for one field of the request.
 pub fn field_error(reason: ErrorReason, field: &str, message: impl Into<String>) -> Error {
     let error = error(ErrorCode::InvalidArgument, reason, message);
     with_subject(error, Subject::Field(field.to_owned()))
 }
 
-/// A message or an array that cannot be used.
+/// The error for a message or an array that cannot be used.
 pub fn frame_error(e: &FrameError) -> Error {
     let wire = error(ErrorCode::InvalidArgument, e.reason(), e.to_string());
     match e.field() {
@@ -49,13 +49,13 @@ pub fn frame_error(e: &FrameError) -> Error {
     }
 }
 
-/// The reason of that stable name; one this version of the protocol lacks stays unspecified, and the
-/// message tells it in words.
+/// The reason with this stable name. A reason that this version of the protocol lacks stays
+/// unspecified; the message describes it.
 fn reason(name: &str) -> ErrorReason {
     ErrorReason::from_str_name(&format!("ERROR_REASON_{name}")).unwrap_or(ErrorReason::Unspecified)
 }
 
-/// An operation of the library failed.
+/// The error for a failed operation of the library.
 pub fn library_error(e: &LibraryError) -> Error {
     let message = e.to_string();
     match e {
@@ -108,7 +108,7 @@ fn store_error(e: &StoreError, message: String) -> Error {
     }
 }
 
-/// Why one shape of a job failed.
+/// The error for a failed shape of a job.
 pub fn failure(f: &Failure) -> Error {
     let code = ErrorCode::from_str_name(&format!("ERROR_CODE_{}", f.code));
     let error = error(
@@ -130,7 +130,7 @@ fn subject(place: FailureSubject) -> Subject {
     }
 }
 
-/// The failure of a shape whose placing the library refused.
+/// The failure of a shape that the library refused to place.
 pub fn library_failure(e: &LibraryError) -> Failure {
     let wire = library_error(e);
     let strip = |name: &'static str, prefix| name.strip_prefix(prefix).unwrap_or(name).to_owned();

@@ -1,4 +1,4 @@
-//! Events of a collection's log.
+//! Converts the events of a collection's log.
 
 use crate::ipc::wire::{self, event::Kind};
 use crate::library::{Event, EventKind};

@@ -1,4 +1,4 @@
-//! Shapes to add, and the jobs they belong to.
+//! Converts shapes to add, and their jobs.
 
 use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
@@ -9,12 +9,12 @@ use crate::mesh::Format;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// What the daemon allows when shapes come in.
+/// The limits on incoming shapes.
 #[derive(Clone, Copy)]
 pub struct Ingest {
-    /// Shapes of one request.
+    /// Maximum number of shapes of one request.
     pub max_shapes: usize,
-    /// Bytes of one shape's file.
+    /// Maximum size of one shape's file in bytes.
     pub max_shape_bytes: u64,
 }
 
@@ -25,23 +25,23 @@ pub struct ShapeInput {
     pub name: String,
     /// Its format.
     pub format: Format,
-    /// Whether it replaces the one of its name.
+    /// Whether it replaces the shape with the same name.
     pub replace: bool,
     /// Its mesh file.
     pub source: Source,
 }
 
-/// Where the bytes of a mesh file are.
+/// The location of the bytes of a mesh file.
 #[derive(Debug)]
 pub enum Source {
-    /// Here.
+    /// In this value.
     Bytes(Vec<u8>),
-    /// In a file that the daemon is to read, if that is allowed.
+    /// In a file for the daemon to read, if it may.
     File(PathBuf),
 }
 
 impl Ingest {
-    /// Refuses the file of a request's `i`th shape if it is too large.
+    /// Rejects the file of a request's `i`th shape if it is too large.
     pub fn check_length(&self, i: usize, name: &str, found: u64) -> Result<(), wire::Error> {
         let limit = self.max_shape_bytes;
         if found <= limit {
@@ -55,14 +55,14 @@ impl Ingest {
     }
 }
 
-/// A job in which a correction is carried.
+/// The job that propagates a correction.
 pub fn carrying_job(job: &Job, carrying: &Carrying) -> wire::Job {
     let finished = carrying.n_left == 0;
     wire::Job {
         job_id: job.id,
         collection: job.collection.clone(),
         items: Vec::new(),
-        // A finished job changes no more.
+        // A finished job does not change.
         revision: if finished {
             u64::MAX
         } else {
@@ -88,7 +88,7 @@ pub fn mesh_format(format: Format) -> wire::MeshFormat {
     }
 }
 
-/// A format from the wire; `None` when it is not given, or one this version does not know.
+/// A format from the wire; `None` if it is unset or unknown to this version.
 pub fn format_from_wire(format: wire::MeshFormat) -> Option<Format> {
     Format::ALL.into_iter().find(|f| mesh_format(*f) == format)
 }
@@ -143,7 +143,7 @@ fn new_shape(
             let bytes = frames
                 .file(mesh.bytes.as_ref(), &format!("{field}.encoded.bytes"))
                 .map_err(|e| frame_error(&e))?;
-            // Before they are copied.
+            // The length is checked before the bytes are copied.
             ingest.check_length(i, &shape.name, bytes.len() as u64)?;
             (Source::Bytes(bytes.to_vec()), format)
         }
@@ -169,7 +169,7 @@ fn new_shape(
     })
 }
 
-/// The OFF file that holds exactly these values: the shortest decimals that read back as the same bits.
+/// Writes exactly these values as an OFF file: the shortest decimals that parse to the same bits.
 fn off_from_arrays(
     mesh: &wire::ArrayMesh,
     field: &str,
@@ -237,7 +237,7 @@ pub fn add_shapes(job_id: u64, n_shapes: usize, job: Option<wire::Job>) -> wire:
     }
 }
 
-/// Whether nothing of the item is left to do.
+/// Whether the item is complete.
 pub fn job_finished(state: &ItemState) -> bool {
     match state {
         ItemState::Queued | ItemState::Running(_) => false,
@@ -266,7 +266,7 @@ fn placed(p: &Placed) -> wire::Placed {
     }
 }
 
-/// One shape of a job; `live_stage` is what it is at in this process, if it is at anything.
+/// One shape of a job; `live_stage` is its present stage in this process, if any.
 pub fn item(i: &JobItem, live_stage: Option<&str>) -> wire::JobItem {
     let mut wire = wire::JobItem {
         index: i.index,

@@ -1,4 +1,4 @@
-//! Wire messages become domain values and back; no other module knows both.
+//! Converts wire messages to domain values and back; no other module knows both.
 
 mod analysis;
 mod checked;

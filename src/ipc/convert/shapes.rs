@@ -1,4 +1,4 @@
-//! Shapes, their labels and their bytes.
+//! Converts shapes, their labels and their bytes.
 
 use super::jobs::mesh_format;
 use crate::ipc::frames::FrameWriter;
@@ -6,7 +6,7 @@ use crate::ipc::wire;
 use crate::library::{Labels, ShapeInfo};
 use crate::mesh::{CleanReport, Format};
 
-/// What cleaning found and did.
+/// The findings and actions of cleaning.
 pub fn clean_report(r: &CleanReport) -> wire::CleanReport {
     wire::CleanReport {
         n_polygons: r.n_polygons as u64,
@@ -60,7 +60,7 @@ pub fn shape(s: &ShapeInfo) -> wire::Shape {
     }
 }
 
-/// Labels, with confidence if it is wanted.
+/// Labels, optionally with confidence.
 pub fn labels(l: &Labels, confidence: bool, frames: &mut FrameWriter) -> wire::GetLabelsReply {
     wire::GetLabelsReply {
         version: l.version,
@@ -86,7 +86,7 @@ pub fn labels_snapshot(
     }
 }
 
-/// The bytes of a shape as they were sent.
+/// The bytes of a shape in their original form.
 pub fn original(
     bytes: Vec<u8>,
     format: Format,

@@ -1,8 +1,8 @@
-//! Collections, their label models, and the event log of each name.
+//! Reads and writes collections, their label models, and the event log of each name.
 //!
-//! Events belong to a collection's *name*: the log stays when the collection is deleted, and a
-//! collection that is created again under the same name goes on where it stopped. So a sequence
-//! number never comes twice, and a subscriber who was away during all of it sees what happened.
+//! Events belong to a collection's *name*: the log stays when the collection is deleted, and a new
+//! collection of the same name continues it. So a sequence number never repeats, and a subscriber
+//! that was disconnected during all of this sees the complete log.
 
 use super::reader::{Fields, Reader, Tx, missing};
 use super::schema::{COLLECTIONS, EVENTS, MODELS, STREAMS};
@@ -60,7 +60,7 @@ impl Reader<'_> {
         })
     }
 
-    /// The label model of a collection, as it was set.
+    /// The stored label model of a collection.
     pub fn model(&self, collection: CollectionId) -> Result<Option<Vec<u8>>> {
         self.first(
             &MODELS,
@@ -78,8 +78,8 @@ impl Reader<'_> {
         Ok(sequence.unwrap_or(0))
     }
 
-    /// Events under a name after `sequence`, oldest first, at most `limit`. Works for names whose
-    /// collection is deleted.
+    /// Events under a name after `sequence`, oldest first, at most `limit`. Deleted collections
+    /// have events, too.
     pub fn events_since(&self, name: &str, sequence: u64, limit: usize) -> Result<Vec<EventRow>> {
         let tail = "WHERE stream_id = (SELECT id FROM streams WHERE name = ?1) AND sequence > ?2
                     ORDER BY sequence LIMIT ?3";
@@ -96,7 +96,7 @@ impl Reader<'_> {
 }
 
 impl Tx<'_> {
-    /// Creates a collection; its log goes on where that of an earlier one of the name stopped.
+    /// Creates a collection; it continues the log of an earlier collection of the same name.
     pub fn insert_collection(&self, new: &NewCollection) -> Result<CollectionId> {
         self.execute(
             "INSERT INTO streams (name, sequence) VALUES (?1, 0) ON CONFLICT (name) DO NOTHING",
@@ -137,7 +137,7 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Replaces what the library keeps with the collection.
+    /// Replaces the library's opaque state of the collection.
     pub fn set_state(&self, id: CollectionId, state: &[u8]) -> Result<()> {
         let sql = "UPDATE collections SET state = ?2 WHERE id = ?1";
         self.change(&COLLECTIONS, id, sql, params![id, state])
@@ -155,21 +155,21 @@ impl Tx<'_> {
         self.change(&COLLECTIONS, id, sql, params![id, n_parts, up])
     }
 
-    /// The next ordinal of a collection; never given out again.
+    /// The next ordinal of a collection; it is never used again.
     pub fn take_ordinal(&self, id: CollectionId) -> Result<u64> {
         let taken = "UPDATE collections SET next_ordinal = next_ordinal + 1 WHERE id = ?1
                      RETURNING next_ordinal - 1";
         self.returned(id, taken, params![id])
     }
 
-    /// The first of `count` new label ids of a collection; never given out again.
+    /// The first of `count` new label ids of a collection; they are never used again.
     pub fn take_labels(&self, id: CollectionId, count: u32) -> Result<u32> {
         let taken = "UPDATE collections SET next_label = next_label + ?2 WHERE id = ?1
                      RETURNING next_label - ?2";
         self.returned(id, taken, params![id, count])
     }
 
-    /// Sees to it that new labels have ids above `label`, which a person has chosen.
+    /// Ensures that new labels have ids above `label`, which a person has chosen.
     pub fn reserve_label(&self, id: CollectionId, label: u32) -> Result<()> {
         let sql = "UPDATE collections SET next_label = max(next_label, ?2) WHERE id = ?1";
         self.change(&COLLECTIONS, id, sql, params![id, u64::from(label) + 1])

@@ -1,4 +1,5 @@
-//! What a person changed, with what is needed to undo it: pinned faces, and labels as they were before.
+//! Reads and writes a person's changes, with the data for undoing them: pinned faces, and previous
+//! labels.
 
 use super::reader::{Fields, Reader, Tx};
 use super::schema::{CORRECTIONS, LABELS_BEFORE, PINS};
@@ -11,7 +12,7 @@ use rusqlite::params;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// The kind of correction that changes no labels of shapes.
+/// The kind of correction that does not change labels of shapes.
 pub const KIND_NAME: &str = "name";
 
 fn correction_row(fields: &Fields<'_>) -> Result<CorrectionRow> {
@@ -24,7 +25,8 @@ fn correction_row(fields: &Fields<'_>) -> Result<CorrectionRow> {
 }
 
 impl Reader<'_> {
-    /// The label a person gave each polygon of a shape, -1 where none; `None`: nothing is pinned.
+    /// The label that a person gave each polygon of a shape, -1 for none; `None`: the shape has no
+    /// pins.
     pub fn pins(&self, shape: ShapeId) -> Result<Option<Vec<i32>>> {
         self.first(&PINS, "WHERE shape_id = ?1", [shape], |fields| {
             fields.unpack("polygon_labels", unpack_labels)
@@ -70,7 +72,7 @@ impl Reader<'_> {
 }
 
 impl Tx<'_> {
-    /// Replaces the pinned faces of a shape; `None`: nothing is pinned.
+    /// Replaces the pinned faces of a shape; `None` removes them.
     pub fn set_pins(&self, shape: ShapeId, polygon_labels: Option<&[i32]>) -> Result<()> {
         self.execute("DELETE FROM pins WHERE shape_id = ?1", [shape])?;
         if let Some(labels) = polygon_labels {
@@ -79,7 +81,7 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Records a correction; from here on the labels it changes are kept as they were before.
+    /// Records a correction; from now on, previous versions of the labels that it changes are kept.
     pub fn insert_correction(
         &self,
         collection: CollectionId,
@@ -97,7 +99,7 @@ impl Tx<'_> {
         self.insert(&CORRECTIONS, format!("{collection}, {kind}"), row)
     }
 
-    /// Forgets a correction and the labels kept for it.
+    /// Deletes a correction and the labels kept for it.
     pub fn delete_correction(&self, id: i64) -> Result<()> {
         self.change(
             &CORRECTIONS,
@@ -107,10 +109,10 @@ impl Tx<'_> {
         )
     }
 
-    /// Notes the newest labels of a shape, which are about to be replaced, with the newest correction
-    /// that changes labels, unless the shape has changed since that one before.
+    /// Stores the newest labels of a shape, which are about to be replaced, with the newest
+    /// correction that changes labels, unless the shape has already changed since that correction.
     pub(super) fn keep_for_undo(&self, shape: &ShapeRow) -> Result<()> {
-        // A shape that replaces another goes on counting, but has no labels before its first.
+        // A shape that replaces another continues its versions, but has no labels before its first.
         if self.labels_at(shape.id, shape.version)?.is_none() {
             return Ok(());
         }
@@ -138,7 +140,7 @@ impl Tx<'_> {
     }
 }
 
-/// Labels and shares as text that reads back exactly: `3 0.25 7 0.75`.
+/// Formats labels and shares as text that parses exactly: `3 0.25 7 0.75`.
 fn shares_to_text(shares: &[(u32, f64)]) -> String {
     let words: Vec<String> = shares
         .iter()

@@ -1,4 +1,4 @@
-//! Jobs that were accepted, and requests that were answered.
+//! Reads and writes accepted jobs and answered requests.
 
 use super::reader::{Fields, Reader, Tx};
 use super::schema::{JOB_ITEMS, JOBS, REQUESTS};
@@ -8,10 +8,10 @@ use rusqlite::params;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// A reply is kept at least this long.
+/// A reply is kept for at least this time.
 const REQUEST_AGE_SECS: u64 = 24 * 60 * 60;
 
-/// Where `meta` keeps the wall clock of the last purge.
+/// The key in `meta` of the wall clock of the last purge.
 const PURGED_AT: &str = "requests_purged_at";
 
 fn job_row(fields: &Fields<'_>) -> Result<JobRow> {
@@ -53,8 +53,8 @@ impl Reader<'_> {
         })
     }
 
-    /// Jobs before `before`, newest first, at most `limit`: all, or those of which an item failed; of all
-    /// collections, or of one.
+    /// Jobs before `before`, newest first, at most `limit`: all jobs, or those with a failed item;
+    /// of all collections, or of one.
     pub fn jobs(
         &self,
         before: u64,
@@ -83,7 +83,7 @@ impl Reader<'_> {
         })
     }
 
-    /// The answer to a request, if it was answered and is still kept.
+    /// The reply to a request, if it was answered and the reply is still kept.
     pub fn request(&self, client_id: &str, request_id: &str) -> Result<Option<RequestRow>> {
         let tail = "WHERE client_id = ?1 AND request_id = ?2";
         self.first(&REQUESTS, tail, [client_id, request_id], |fields| {
@@ -115,7 +115,7 @@ fn item_row(fields: &Fields<'_>, collection: String) -> Result<JobItemRow> {
 }
 
 impl Tx<'_> {
-    /// Accepts shapes, whose original bytes must be catalogued; the id of their job.
+    /// Accepts shapes, whose original bytes must be catalogued; returns the id of their job.
     pub fn insert_job(
         &self,
         collection: &str,
@@ -141,7 +141,7 @@ impl Tx<'_> {
         Ok(job.unsigned_abs())
     }
 
-    /// Says how far an item is.
+    /// Sets the status of an item.
     pub fn set_item(
         &self,
         job: u64,
@@ -159,7 +159,7 @@ impl Tx<'_> {
         )
     }
 
-    /// Forgets jobs accepted before a moment that have nothing queued; how many.
+    /// Deletes jobs without queued items that were accepted before a moment; returns their number.
     pub fn purge_jobs(&self, created_before_unix_secs: u64) -> Result<u64> {
         let sql = "DELETE FROM jobs WHERE created < ?1 AND NOT EXISTS (
                      SELECT 1 FROM job_items WHERE job_id = jobs.id AND status = 'queued')";
@@ -167,7 +167,7 @@ impl Tx<'_> {
         Ok(self.execute(sql, [before])? as u64)
     }
 
-    /// Keeps the answer to a request, in the transaction of its effect.
+    /// Stores the reply to a request, in the transaction of its effect.
     pub fn put_request(&self, row: &RequestRow) -> Result<()> {
         let key = format!("{}, {}", row.client_id, row.request_id);
         let row = params![
@@ -181,10 +181,11 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Forgets answers older than `keep_secs`, which counts as at least 24 h; how many.
+    /// Deletes replies older than `keep_secs`, which counts as at least 24 h; returns their number.
     ///
-    /// To be called about hourly, before [`Tx::purge_jobs`]. If the wall clock has jumped since the last call (or nobody
-    /// called for a day), answers and jobs age by nothing for that time, so that a jump forgets none.
+    /// Call it about hourly, before [`Tx::purge_jobs`]. If the wall clock has jumped since the last
+    /// call (or a day has passed without a call), replies and jobs do not age for that time, so
+    /// that a jump deletes none.
     pub fn purge_requests(&self, now_unix_secs: u64, keep_secs: u64) -> Result<u64> {
         let now = now_unix_secs.min(i64::MAX as u64);
         let last = self

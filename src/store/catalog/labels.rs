@@ -1,4 +1,4 @@
-//! Labels of collections, versions of the labels of shapes, and their statistics.
+//! Reads and writes labels of collections, versions of the labels of shapes, and their statistics.
 
 use super::reader::{Fields, Reader, Tx, missing};
 use super::schema::{LABEL_VERSIONS, LABELS, SHAPE_LABELS, SHAPE_STATS, SHAPES};
@@ -10,8 +10,8 @@ use std::collections::BTreeMap;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// Versions of the labels of one shape that stay readable: the newest. At one to ten kilobytes a
-/// version this bounds the history of a shape below the size of its arrays.
+/// The number of newest versions of the labels of one shape that stay readable. At one to ten
+/// kilobytes for each version this bounds the history of a shape below the size of its arrays.
 pub const KEPT_LABEL_VERSIONS: u64 = 64;
 
 fn label_version_row(fields: &Fields<'_>) -> Result<LabelVersionRow> {
@@ -55,7 +55,7 @@ impl Reader<'_> {
         self.first(&LABEL_VERSIONS, tail, [shape], label_version_row)
     }
 
-    /// One version of the labels of a shape; `None` if it is not (or no longer) kept.
+    /// One version of the labels of a shape; `None` if it is not (or no longer) stored.
     pub fn labels_at(&self, shape: ShapeId, version: u64) -> Result<Option<LabelVersionRow>> {
         let version = i64::try_from(version).unwrap_or(i64::MAX);
         let tail = "WHERE shape_id = ?1 AND version = ?2";
@@ -67,7 +67,7 @@ impl Reader<'_> {
         )
     }
 
-    /// The versions of the labels of a shape that are kept, oldest first.
+    /// The stored versions of the labels of a shape, oldest first.
     pub fn kept_versions(&self, shape: ShapeId) -> Result<Vec<u64>> {
         let tail = "WHERE shape_id = ?1 ORDER BY version";
         self.all(&LABEL_VERSIONS, tail, [shape], |fields| {
@@ -75,7 +75,7 @@ impl Reader<'_> {
         })
     }
 
-    /// Each label the newest labels of a shape carry, with its share of the area.
+    /// Each label in the newest labels of a shape, with its share of the area.
     pub fn area_shares(&self, shape: ShapeId) -> Result<Vec<(u32, f64)>> {
         self.all(
             &SHAPE_LABELS,
@@ -85,7 +85,7 @@ impl Reader<'_> {
         )
     }
 
-    /// For each label the number of shapes of a collection whose newest labels carry it.
+    /// For each label the number of shapes of a collection whose newest labels contain it.
     pub fn label_uses(&self, collection: CollectionId) -> Result<BTreeMap<u32, u64>> {
         let sql = "SELECT label, count(*) FROM shape_labels JOIN shapes ON shapes.id = shape_id
                    WHERE collection_id = ?1 GROUP BY label";
@@ -94,7 +94,7 @@ impl Reader<'_> {
         Ok(uses.collect::<rusqlite::Result<_>>()?)
     }
 
-    /// The statistics of a shape and the epoch they are of.
+    /// The statistics of a shape, and their epoch.
     pub fn stats(&self, shape: ShapeId) -> Result<Option<(u64, Vec<u8>)>> {
         self.first(&SHAPE_STATS, "WHERE shape_id = ?1", [shape], |fields| {
             Ok((fields.get("epoch")?, fields.unpack("stats", unpack_bytes)?))
@@ -102,7 +102,7 @@ impl Reader<'_> {
     }
 
     /// Calls `visit` with shape, epoch and statistics of each shape of a collection that has some,
-    /// in order of their ids, without holding them all.
+    /// in order of their ids, without loading all of them.
     pub fn each_stats(
         &self,
         collection: CollectionId,
@@ -132,11 +132,10 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Makes these the newest labels of a shape: stores the version, says so in the shape's row
-    /// (which is then not stale), and forgets versions beyond [`KEPT_LABEL_VERSIONS`] that no
-    /// correction needs to be undone.
+    /// Makes these the newest labels of a shape: stores the version, updates the shape's row (which
+    /// is then not stale), and deletes versions beyond [`KEPT_LABEL_VERSIONS`] that no undo needs.
     ///
-    /// The version must be the shape's plus 1 and the labels as many as the shape has polygons.
+    /// The version must be the shape's plus 1, with as many labels as the shape has polygons.
     pub fn put_labels(
         &self,
         shape: ShapeId,
@@ -220,7 +219,7 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Forgets the statistics of a shape, if there are any.
+    /// Deletes the statistics of a shape, if it has any.
     pub fn delete_stats(&self, shape: ShapeId) -> Result<()> {
         self.execute("DELETE FROM shape_stats WHERE shape_id = ?1", [shape])?;
         Ok(())

@@ -1,10 +1,10 @@
-//! Finds damage in the catalog's write-ahead log, which SQLite itself takes for its end.
+//! Finds damage in the catalog's write-ahead log, which SQLite itself takes for the end of the log.
 //!
-//! Recovery reads the log up to the first frame whose checksum is wrong, because that is what a
-//! commit looks like that a crash interrupted. A bit that rots in the middle looks the same, and all
-//! commits after it would be forgotten without a word. The two can be told apart: each commit is
-//! synced before the next begins, so behind an interrupted one there is none, and in it there is
-//! one frame at most that says "commit". (Format: "Database File Format", section 4, sqlite.org.)
+//! Recovery reads the log up to the first frame whose checksum is wrong, because a commit that a
+//! crash interrupted looks like that. A flipped bit in the middle looks the same, and all commits
+//! after it would be lost silently. The two can be distinguished: each commit is synced before the
+//! next begins, so no commit follows an interrupted one, which itself contains at most one frame
+//! marked as commit. (Format: "Database File Format", section 4, sqlite.org.)
 
 use std::io;
 use std::path::Path;
@@ -12,9 +12,9 @@ use std::path::Path;
 const HEADER: usize = 32;
 const FRAME_HEADER: usize = 24;
 
-/// What is wrong with the log at `path`; `None`: nothing, as far as one can know.
+/// The damage of the log at `path`; `None` if none can be found.
 ///
-/// May be asked beside a writer: what two looks agree on did not change in between.
+/// It may run beside a writer: a finding that two reads agree on did not change in between.
 pub(in crate::store) fn damage(path: &Path) -> io::Result<Option<String>> {
     let look = || match std::fs::read(path) {
         Ok(log) => Ok(damage_in(&log)),
@@ -43,8 +43,8 @@ fn damage_in(log: &[u8]) -> Option<(String, [u8; 8])> {
         && (512..=65_536).contains(&page_bytes)
         && checksum([0; 2], &header[..24], big_endian) == sums_at(header, 24);
     if !whole_header {
-        // One sector is written as a whole or not at all, and a log that was never synced is empty
-        // or zero there.
+        // One sector is written entirely or not at all, and a log that was never synced is empty or
+        // zero there.
         let blank = header.iter().all(|&byte| byte == 0) && log.len() <= HEADER;
         return (!blank).then(|| ("the header of the log is damaged".into(), salts));
     }
@@ -74,7 +74,7 @@ fn damage_in(log: &[u8]) -> Option<(String, [u8; 8])> {
     Some((message, salts))
 }
 
-/// SQLite's checksum, going on from `sums`; `bytes` are a multiple of 8.
+/// SQLite's checksum, continued from `sums`; the length of `bytes` is a multiple of 8.
 fn checksum(sums: [u32; 2], bytes: &[u8], big_endian: bool) -> [u32; 2] {
     let word = |bytes: [u8; 4]| match big_endian {
         true => u32::from_be_bytes(bytes),
@@ -146,7 +146,7 @@ mod tests {
             .map(|(index, _)| index)
             .collect();
         assert!(commits.len() >= 5, "{commits:?}");
-        // Up to the last commit but one everything is followed by two.
+        // Everything up to the last commit but one is followed by two commits.
         let end = HEADER + (commits[commits.len() - 2]) * (FRAME_HEADER + 4096);
         for at in (0..HEADER).chain((HEADER..end).step_by(97)) {
             let mut rotten = log.clone();

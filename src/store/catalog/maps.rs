@@ -1,4 +1,5 @@
-//! Functional maps that are kept, for parts and between points. A map goes when either of its shapes goes.
+//! Reads and writes stored functional maps, for parts and between points. A map is deleted together
+//! with either of its shapes.
 
 use super::reader::{Fields, Reader, Tx};
 use super::schema::{MAP_CONFIDENCE, MAPS, POINT_MAPS};
@@ -9,7 +10,7 @@ use crate::store::codec::{
 use crate::store::rows::{MapRow, PointMapRow, ShapeId};
 use rusqlite::params;
 
-/// Most maps between points that are kept; the oldest go first.
+/// Maximum number of stored maps between points; the oldest are deleted first.
 pub(super) const MAX_POINT_MAPS: u64 = 500;
 
 type Result<T> = std::result::Result<T, StoreError>;
@@ -58,7 +59,7 @@ fn point_map_row(fields: &Fields<'_>) -> Result<PointMapRow> {
 }
 
 impl Reader<'_> {
-    /// The map that carries functions on `from` to `to`.
+    /// The map that transfers functions on `from` to `to`.
     pub fn map(&self, from: ShapeId, to: ShapeId) -> Result<Option<MapRow>> {
         let found = self.first(
             &MAPS,
@@ -90,7 +91,8 @@ impl Reader<'_> {
         Ok(row)
     }
 
-    /// The maps between points that were found for a request, as the library writes it, best first; none if none is kept.
+    /// The stored maps between points for a request in the library's format, best first; empty if
+    /// there are none.
     pub fn point_maps(
         &self,
         from: ShapeId,
@@ -105,7 +107,7 @@ impl Reader<'_> {
         )
     }
 
-    /// Which maps between points there are: from, to, request. Their rows are not read.
+    /// The keys of stored maps between points: from, to, request. Their rows are not read.
     pub fn point_map_keys(&self) -> Result<Vec<(ShapeId, ShapeId, String)>> {
         let mut statement = self.connection().prepare_cached(
             "SELECT DISTINCT from_shape, to_shape, request FROM point_maps
@@ -118,7 +120,7 @@ impl Reader<'_> {
         Ok(keys.collect::<rusqlite::Result<_>>()?)
     }
 
-    /// All maps that carry functions to a shape, in order of their sources' ids.
+    /// All maps that transfer functions to a shape, in order of their sources' ids.
     pub fn maps_into(&self, to: ShapeId) -> Result<Vec<MapRow>> {
         let tail = "WHERE to_shape = ?1 ORDER BY from_shape";
         let rows = self.all(&MAPS, tail, [to], map_row)?;
@@ -127,7 +129,7 @@ impl Reader<'_> {
             .collect()
     }
 
-    /// The shapes that a shape's functions are carried to, in order of their ids.
+    /// The shapes that receive a shape's functions, in order of their ids.
     pub fn mapped_from(&self, from: ShapeId) -> Result<Vec<ShapeId>> {
         let sql = "SELECT to_shape FROM maps WHERE from_shape = ?1 ORDER BY to_shape";
         let mut statement = self.connection().prepare_cached(sql)?;
@@ -135,7 +137,7 @@ impl Reader<'_> {
         Ok(shapes.collect::<rusqlite::Result<_>>()?)
     }
 
-    /// Which maps there are: from, to. Their rows are not read.
+    /// The keys of stored maps: from, to. Their rows are not read.
     pub fn map_keys(&self) -> Result<Vec<(ShapeId, ShapeId)>> {
         let mut statement = self.connection().prepare_cached(
             "SELECT from_shape, to_shape FROM maps ORDER BY from_shape, to_shape",
@@ -178,8 +180,8 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Keeps the maps between points that were found for a request, best first, in the place of those that were. The
-    /// oldest of more than [`MAX_POINT_MAPS`] are forgotten.
+    /// Stores the maps between points for a request, best first, and replaces earlier ones. Of more
+    /// than [`MAX_POINT_MAPS`] the oldest are deleted.
     pub fn put_point_maps(
         &self,
         from: ShapeId,
@@ -211,7 +213,7 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Forgets the maps between points that were found for a request, if they are there.
+    /// Deletes the maps between points for a request, if they exist.
     pub fn delete_point_maps(&self, from: ShapeId, to: ShapeId, request: &str) -> Result<()> {
         self.execute(
             "DELETE FROM point_maps WHERE from_shape = ?1 AND to_shape = ?2 AND request = ?3",
@@ -220,7 +222,7 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Forgets a map, if it is there.
+    /// Deletes a map, if it exists.
     pub fn delete_map(&self, from: ShapeId, to: ShapeId) -> Result<()> {
         self.execute(
             "DELETE FROM maps WHERE from_shape = ?1 AND to_shape = ?2",

@@ -1,8 +1,9 @@
-//! What exists: collections, shapes, labels, maps, jobs, requests and events, in one SQLite file.
+//! Records all that exists (collections, shapes, labels, maps, jobs, requests and events) in one
+//! SQLite file.
 //!
 //! One connection writes, behind a lock; a write is one transaction and durable when it returns
-//! (`synchronous=FULL`). Readers have connections of their own and see the last commit as of the
-//! moment they began; with the write-ahead log they never wait for the writer, nor it for them.
+//! (`synchronous=FULL`). Readers have connections of their own and see the last commit at the
+//! moment they began; with the write-ahead log readers and the writer never wait for each other.
 
 mod collections;
 mod corrections;
@@ -29,23 +30,24 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use witness::{Found, Witness};
 
-/// Other processes hold the file's lock only for moments (a worker that commits, a backup, `sqlite3`), but a disk can be
-/// slow.
+/// Other processes hold the file's lock only briefly (a worker that commits, a backup, `sqlite3`),
+/// but a disk can be slow.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Memory for pages of each connection, in KiB. Everything else is a copy of what the kernel keeps
-/// of the file anyway; with SQLite's default the connections of a daemon grow by 10 MB over its
-/// first thousands of operations.
+/// Memory for pages of each connection, in KiB. The kernel caches the rest of the file anyway; with
+/// SQLite's default the connections of a daemon grow by 10 MB over its first thousands of
+/// operations.
 const PAGE_CACHE_KIB: i64 = 256;
 
-/// Connections that are kept for the next reader; a burst opens more and closes them again.
+/// Number of idle connections that are kept for the next readers; a burst opens more and closes
+/// them again.
 const KEPT_READERS: usize = 4;
 
-/// The write-ahead log is copied into the file whenever it has grown by this much.
+/// The write-ahead log is copied into the file whenever it has grown by this size.
 const CHECKPOINT_BYTES: u64 = 4 << 20;
 
 /// Catalogs up to this size have their structure checked when they are opened, which takes a few
-/// tenths of a second; larger ones are left to `check`.
+/// tenths of a second; larger ones are checked by `check` only.
 const CHECKED_AT_OPEN_BYTES: u64 = 64 << 20;
 
 /// The catalog of one library.
@@ -53,7 +55,7 @@ const CHECKED_AT_OPEN_BYTES: u64 = 64 << 20;
 pub struct Catalog {
     path: PathBuf,
     health: Health,
-    /// Whether this process holds the library; if not it writes beside the one that does.
+    /// Whether this process holds the library; otherwise it writes beside the process that does.
     holds: bool,
     writer: Mutex<Writer>,
     readers: Mutex<Vec<Connection>>,
@@ -67,12 +69,12 @@ struct Writer {
 }
 
 impl Catalog {
-    /// Opens the catalog at `path`, which is created if it is missing. The caller holds the
-    /// library's lock.
+    /// Opens the catalog at `path`, which is created if missing. The caller must hold the library's
+    /// lock.
     pub fn open(path: &Path, health: Health) -> Result<Self, StoreError> {
         let log = log_of(path);
         if let Some(message) = log::damage(&log).map_err(|e| StoreError::io(&log, e))? {
-            // Opening would forget the commits behind the damage for good.
+            // Opening it would permanently delete the commits behind the damage.
             return Err(StoreError::Damaged {
                 path: log.display().to_string(),
                 message,
@@ -91,8 +93,8 @@ impl Catalog {
         Ok(Self::over(connection, path, health, true))
     }
 
-    /// Opens the catalog at `path`, which another process has opened and goes on to use. Each waits for the other's
-    /// writes, a few seconds at most.
+    /// Opens the catalog at `path`, which another process has opened and continues to use. Each
+    /// process waits for the other's writes, a few seconds at most.
     pub fn open_beside(path: &Path, health: Health) -> Result<Self, StoreError> {
         let connection = open_writer(path, OpenFlags::empty())?;
         schema::check_format(&connection, &path.display().to_string())?;
@@ -115,7 +117,7 @@ impl Catalog {
     }
 
     /// Runs `change` in a transaction, which is durable when this returns `Ok`, and leaves no trace
-    /// otherwise. Not to be called within a change: there is one writer, and it is busy.
+    /// otherwise. Must not be called within a change, since the only writer is then busy.
     pub fn write<T, E: From<StoreError>>(
         &self,
         change: impl FnOnce(&Tx<'_>) -> Result<T, E>,
@@ -137,19 +139,18 @@ impl Catalog {
         let Some(number) = number else {
             return Ok(value);
         };
-        // Only now: the witness promises nothing that is not durable.
+        // The witness advances only now, so that it promises nothing that is not durable.
         if let Err(error) = Witness::advance(&self.path, number) {
             tracing::warn!(%error, "{} cannot be written", witness::WITNESS_FILE);
         }
-        // The change is durable, whatever becomes of the checkpoint: a failed sync stops the
-        // writes that come after it.
+        // The change is durable even if the checkpoint fails: a failed sync stops later writes.
         if let Err(error) = self.checkpoint_if_due(&mut writer, number) {
             tracing::error!(%error, "the catalog's log could not be checkpointed");
         }
         Ok(value)
     }
 
-    /// Runs `view` on the catalog as it stands now; later commits are not seen.
+    /// Runs `view` on the catalog in its present state; it does not see later commits.
     pub fn read<T, E: From<StoreError>>(
         &self,
         view: impl FnOnce(&Reader<'_>) -> Result<T, E>,
@@ -170,7 +171,8 @@ impl Catalog {
         value
     }
 
-    /// Copies the write-ahead log, whose newest commit has at least this number, into the file if it has grown enough.
+    /// Copies the write-ahead log, whose newest commit has at least this number, into the file if
+    /// it is long enough.
     fn checkpoint_if_due(&self, writer: &mut Writer, number: u64) -> Result<(), StoreError> {
         let length = std::fs::metadata(log_of(&self.path)).map_or(0, |metadata| metadata.len());
         if length < writer.checkpoint_at {
@@ -181,9 +183,9 @@ impl Catalog {
         Ok(())
     }
 
-    /// Copies the log into the file and empties it, unless readers need it; whether it did.
+    /// Copies the log into the file and empties it, unless readers need it; returns whether it did.
     fn checkpoint(&self, writer: &Writer, number: u64) -> Result<bool, StoreError> {
-        // Not waiting for readers: what they still need is copied the next time.
+        // The checkpoint does not wait for readers: frames that they need are copied the next time.
         writer.connection.busy_timeout(Duration::ZERO)?;
         let busy = writer
             .connection
@@ -196,7 +198,7 @@ impl Catalog {
         if copied {
             let (library, old) = match Witness::read(&self.path)? {
                 Found::Whole(old) => (old.library.clone(), Some(old)),
-                // Whoever took it away gets another.
+                // If the witness was removed, a new one is written.
                 _ => (Reader::new(&writer.connection).library_id()?, None),
             };
             let at_least = |before: Option<u64>| number.max(before.unwrap_or(0));
@@ -215,14 +217,14 @@ impl Catalog {
         Ok(copied)
     }
 
-    /// Empties the log, so that the file alone is the catalog. For the end of whoever holds the library, when nobody
-    /// writes beside it any more.
+    /// Empties the log, so that the file alone is the catalog. The process that holds the library
+    /// calls it at its end, when no other process writes.
     pub fn settle(&self) {
         if !self.holds || self.health.writable().is_err() {
             return;
         }
         if let Err(error) = self.try_settle() {
-            // The log stays, and the next one who opens the library reads it.
+            // The log stays, and the next process that opens the library reads it.
             tracing::warn!(%error, "the catalog's log was left as it is");
         }
     }
@@ -232,7 +234,8 @@ impl Catalog {
         let writer = self.writer();
         let number = Reader::new(&writer.connection).n_commits()?;
         if self.checkpoint(&writer, number)? {
-            // Nothing is left to copy: whoever closes the file last may remove the empty log.
+            // The log has been copied, so the process that closes the file last may remove the
+            // empty log.
             let keep = DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE;
             writer.connection.set_db_config(keep, false)?;
         }
@@ -273,13 +276,13 @@ impl Drop for Catalog {
     }
 }
 
-/// Sees to it that there is a witness that promises what the catalog holds.
+/// Ensures that a witness exists that matches the catalog.
 fn bear_witness(connection: &Connection, path: &Path) -> Result<(), StoreError> {
     Witness::tidy(path)?;
     let reader = Reader::new(connection);
     let (library, committed) = match (reader.library_id(), reader.n_commits()) {
         (Ok(library), Ok(committed)) => (library, committed),
-        // `check` names the row.
+        // `check` names the damaged row.
         (Err(e), _) | (_, Err(e)) if e.is_damage() => return Ok(()),
         (Err(e), _) | (_, Err(e)) => return Err(e),
     };
@@ -298,7 +301,7 @@ fn bear_witness(connection: &Connection, path: &Path) -> Result<(), StoreError> 
         committed,
     };
     match witness.write(path) {
-        // A full disk keeps nobody from reading.
+        // A full disk must not prevent reading.
         Err(error @ StoreError::NoSpace { .. }) => {
             tracing::warn!(%error, "no witness of the catalog's log");
             Ok(())
@@ -313,15 +316,15 @@ fn open_writer(path: &Path, more: OpenFlags) -> Result<Connection, StoreError> {
     let connection = Connection::open_with_flags(path, flags)?;
     schema::register_row_sum(&connection)?;
     connection.busy_timeout(BUSY_TIMEOUT)?;
-    // Negative: of this size, not so many pages.
+    // Negative: a size in KiB, rather than a number of pages.
     connection.pragma_update(None, "cache_size", -PAGE_CACHE_KIB)?;
     connection.pragma_update(None, "foreign_keys", true)?;
-    // What the log holds is copied into the file by checkpoints only, which see whether they fail.
+    // Only checkpoints copy the log into the file, because they check for failures.
     connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
     Ok(connection)
 }
 
-/// How a connection commits.
+/// Sets how a connection commits.
 fn prepare_writer(connection: &Connection, path: &Path) -> Result<(), StoreError> {
     let mode: String =
         connection.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
@@ -332,16 +335,16 @@ fn prepare_writer(connection: &Connection, path: &Path) -> Result<(), StoreError
         });
     }
     connection.pragma_update(None, "synchronous", "FULL")?;
-    // With neither spills nor automatic checkpoints, all syncs happen in COMMIT and in
-    // `checkpoint`, where their failures are seen.
+    // Without spills and automatic checkpoints, all syncs happen in COMMIT and in `checkpoint`,
+    // where failures are detected.
     connection.pragma_update(None, "cache_spill", false)?;
     connection.pragma_update(None, "wal_autocheckpoint", 0)?;
     connection.set_prepared_statement_cache_capacity(128);
     Ok(())
 }
 
-/// Looks for structural damage, which a lookup may not notice: a row that a broken index hides seems
-/// not to be there. Writing on such ground (a request that seems new) would make it worse.
+/// Searches for structural damage, which a lookup may miss: a row behind a broken index seems to be
+/// missing. Writes based on such a lookup (of a request that seems new) would increase the damage.
 fn refuse_writes_if_damaged(
     connection: &Connection,
     path: &Path,
@@ -473,7 +476,7 @@ mod tests {
         let length = || std::fs::metadata(&log).expect("there").len();
         write();
         assert!(length() <= CHECKPOINT_BYTES + (1 << 19), "{}", length());
-        // Beside a reader that keeps the log from being emptied, commits go on.
+        // While a reader keeps the log from being emptied, commits continue.
         let seen = catalog.read(|r| {
             let before = r.collection_by_id(id)?.expect("there").state;
             write();

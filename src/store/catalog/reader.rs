@@ -1,4 +1,4 @@
-//! Reading and writing rows: what every table's methods are made of.
+//! Reads and writes rows; the methods of all tables build on this module.
 
 use super::schema::{META, Table};
 use super::witness::{COMMITS, LIBRARY_ID};
@@ -11,7 +11,7 @@ use std::ops::Deref;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// The catalog as of one moment.
+/// The catalog at one moment.
 #[derive(Debug)]
 pub struct Reader<'c> {
     connection: &'c Connection,
@@ -44,7 +44,7 @@ impl Fields<'_> {
         self.row.get(index).map_err(|e| self.damaged(column, e))
     }
 
-    /// The value a packed blob unpacks to.
+    /// The value of a packed blob.
     pub(super) fn unpack<T>(
         &self,
         column: &str,
@@ -155,7 +155,7 @@ impl<'c> Reader<'c> {
             .query_row(params, |row| row.get(0))?)
     }
 
-    /// Texts that are for people to read, and that no sum is checked of.
+    /// Texts for people, whose sums are not checked.
     pub(super) fn names(&self, sql: &str, params: impl Params) -> Result<Vec<String>> {
         let mut statement = self.connection.prepare_cached(sql)?;
         let rows = statement.query_map(params, |row| row.get(0))?;
@@ -170,13 +170,13 @@ impl<'c> Reader<'c> {
             .optional()?)
     }
 
-    /// A random name the library got when it was created.
+    /// The random name that the library got when it was created.
     pub fn library_id(&self) -> Result<String> {
         self.meta(LIBRARY_ID)?
             .ok_or_else(|| missing(&META, LIBRARY_ID))
     }
 
-    /// Changes that were committed since commits are numbered.
+    /// Number of commits since commits are numbered.
     pub fn n_commits(&self) -> Result<u64> {
         let Some(text) = self.meta(COMMITS)? else {
             return Ok(0);
@@ -215,8 +215,8 @@ impl<'c> Tx<'c> {
         }
     }
 
-    /// Gives this commit its number; `known`, which is at least that of the one before, is asked if the catalog's own
-    /// number cannot be read.
+    /// Numbers this commit; if the catalog's own number cannot be read, calls `known`, which
+    /// returns at least the number of the previous commit.
     pub(super) fn number_commit(&self, known: impl FnOnce() -> u64) -> Result<u64> {
         let before = match self.n_commits() {
             Err(e) if e.is_damage() => known(),
@@ -231,13 +231,13 @@ impl<'c> Tx<'c> {
         Ok(number)
     }
 
-    /// Commits this transaction even if it changes nothing else.
+    /// Commits this transaction even if it contains no other change.
     pub fn touch(&self) -> Result<()> {
         self.execute("UPDATE meta SET value = value WHERE key = 'format'", [])?;
         Ok(())
     }
 
-    /// Inserts a row of all columns; a taken key is told apart.
+    /// Inserts a row of all columns; an existing key gets an error of its own.
     pub(super) fn insert(
         &self,
         table: &'static Table,
@@ -261,7 +261,7 @@ impl<'c> Tx<'c> {
         }
     }
 
-    /// Runs a statement; how many rows it changed.
+    /// Runs a statement; returns the number of changed rows.
     pub(super) fn execute(&self, sql: &str, params: impl Params) -> Result<usize> {
         Ok(self.connection().prepare_cached(sql)?.execute(params)?)
     }

@@ -1,8 +1,8 @@
-//! The catalog's tables, their versions, and a sum over every row.
+//! Defines the catalog's tables, their versions, and a checksum for every row.
 //!
-//! SQLite checks the structure of its pages, not the values in them. So every row carries `sum`, the
-//! first eight bytes of a BLAKE3 over its other columns, kept by triggers and compared whenever a
-//! row is read: a flipped bit is an error that names the row, never a wrong answer.
+//! SQLite checks the structure of its pages, but not the values in them. So every row has a column
+//! `sum`, the first eight bytes of a BLAKE3 over its other columns. Triggers maintain it, and every
+//! read compares it: a flipped bit becomes an error that names the row, never a wrong answer.
 
 use crate::store::StoreError;
 use crate::store::error::CATALOG_FILE;
@@ -10,19 +10,20 @@ use rusqlite::functions::FunctionFlags;
 use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
-/// Version of the catalog's tables; newer ones are refused.
+/// Version of the catalog's tables; newer ones are rejected.
 pub const CATALOG_FORMAT: u32 = 3;
 
-/// The format before corrections: its tables are there unchanged, [`SINCE_FORMAT_2`] are missing.
+/// The format before corrections: it lacks the tables in [`SINCE_FORMAT_2`].
 const WITHOUT_CORRECTIONS: u32 = 1;
 
-/// The format before maps said what to expect of them vertex by vertex: [`SINCE_FORMAT_3`] are missing.
+/// The format before maps had a confidence for each vertex: it lacks the tables in
+/// [`SINCE_FORMAT_3`].
 const WITHOUT_CONFIDENCE: u32 = 2;
 
-/// `cseg`, where SQLite files say whose they are.
+/// `cseg`, the application id in the header of the SQLite file.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
 
-/// A table: its key, all its columns but `sum`, and what else its definition says.
+/// A table: its key, all its columns except `sum`, and the rest of its definition.
 pub(crate) struct Table {
     pub(crate) name: &'static str,
     /// The first `n_key` columns name a row.
@@ -32,7 +33,7 @@ pub(crate) struct Table {
 }
 
 impl Table {
-    /// `SELECT` of all columns and of whether the sum is right.
+    /// `SELECT` of all columns, and of whether the sum is right.
     pub(crate) fn select(&self, tail: &str) -> String {
         let columns = self.columns.join(", ");
         format!(
@@ -210,7 +211,7 @@ tables! {
 /// Tables that format 2 added.
 const SINCE_FORMAT_2: [&Table; 3] = [&PINS, &CORRECTIONS, &LABELS_BEFORE];
 
-/// Indexes of those.
+/// Indexes of these tables.
 const INDEXES_SINCE_FORMAT_2: &str = "
     CREATE INDEX corrections_by_collection ON corrections (collection_id, id);
     CREATE INDEX labels_before_by_shape ON labels_before (shape_id, version);
@@ -219,7 +220,7 @@ const INDEXES_SINCE_FORMAT_2: &str = "
 /// Tables that format 3 added.
 const SINCE_FORMAT_3: [&Table; 2] = [&MAP_CONFIDENCE, &POINT_MAPS];
 
-/// Indexes of those.
+/// Indexes of these tables.
 const INDEXES_SINCE_FORMAT_3: &str = "
     CREATE INDEX point_maps_by_to ON point_maps (to_shape);
 ";
@@ -235,8 +236,8 @@ const INDEXES: &str = "
     CREATE INDEX requests_by_time ON requests (created);
 ";
 
-/// Makes `row_sum` known to a connection: of any number of values the first eight bytes of a BLAKE3
-/// over each value's type, length and bytes.
+/// Defines the function `row_sum` on a connection: the first eight bytes of a BLAKE3 over the type,
+/// length and bytes of each argument.
 pub(in crate::store) fn register_row_sum(connection: &Connection) -> rusqlite::Result<()> {
     let flags = FunctionFlags::SQLITE_UTF8
         | FunctionFlags::SQLITE_DETERMINISTIC
@@ -263,7 +264,7 @@ pub(in crate::store) fn register_row_sum(connection: &Connection) -> rusqlite::R
     })
 }
 
-/// Brings an empty file to the current format; refuses files that are not a catalog, or newer.
+/// Brings an empty file to the current format; rejects files that are not a catalog, or newer.
 pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), StoreError> {
     let n_tables: i64 =
         connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| row.get(0))?;
@@ -288,7 +289,7 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     Ok(())
 }
 
-/// Brings a catalog of an older format to this one, in one transaction; others are left alone.
+/// Upgrades a catalog of an older format to this one, in one transaction; leaves others unchanged.
 fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     let pragma = |name: &str| -> rusqlite::Result<u32> {
         connection.pragma_query_value(None, name, |row| row.get(0))
@@ -318,7 +319,7 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Refuses files that are not a catalog of a format this version reads.
+/// Rejects files that are not a catalog of a supported format.
 pub(in crate::store) fn check_format(
     connection: &Connection,
     path: &str,

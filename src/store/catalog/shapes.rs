@@ -1,4 +1,4 @@
-//! Shapes and the object files they need.
+//! Reads and writes shapes and the rows of their object files.
 
 use super::reader::{Fields, Reader, Tx, missing};
 use super::schema::{OBJECTS, SHAPE_SIGNATURES, SHAPES};
@@ -11,7 +11,8 @@ use rusqlite::params;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// That nothing needs a row of `objects`. A failed item may be tried again.
+/// The condition that no shape or item needs a row of `objects`. Failed items count, since they may
+/// be retried.
 const UNREFERENCED: &str = "
     CASE kind
     WHEN 'description' THEN NOT EXISTS (
@@ -65,7 +66,7 @@ impl Reader<'_> {
     }
 
     /// Shapes by ordinal, after `after_ordinal`, at most `limit`; with `label`, only those whose
-    /// newest labels carry it.
+    /// newest labels contain it.
     pub fn shapes(
         &self,
         collection: CollectionId,
@@ -94,7 +95,8 @@ impl Reader<'_> {
         }
     }
 
-    /// The stale shape of lowest ordinal, in one collection or (the oldest collection first) in any.
+    /// The stale shape of lowest ordinal, in one collection or in all (the oldest collection
+    /// first).
     pub fn next_stale(&self, collection: Option<CollectionId>) -> Result<Option<ShapeRow>> {
         match collection {
             Some(id) => {
@@ -108,20 +110,20 @@ impl Reader<'_> {
         }
     }
 
-    /// Shapes whose labels wait to be recomputed, by ordinal.
+    /// Stale shapes, by ordinal.
     pub fn stale_shapes(&self, collection: CollectionId) -> Result<Vec<ShapeId>> {
         let tail = "WHERE stale AND collection_id = ?1 ORDER BY ordinal";
         self.all(&SHAPES, tail, [collection], |fields| fields.get("id"))
     }
 
-    /// Names of the first shapes of a collection, at most `limit`, without a look at the rest of
+    /// Names of the first shapes of a collection, at most `limit`, without reading the rest of
     /// their rows.
     pub fn shape_names(&self, collection: CollectionId, limit: u32) -> Result<Vec<String>> {
         let sql = "SELECT name FROM shapes WHERE collection_id = ?1 ORDER BY ordinal LIMIT ?2";
         self.names(sql, params![collection, limit])
     }
 
-    /// Shapes of a collection.
+    /// Number of shapes of a collection.
     pub fn n_shapes(&self, collection: CollectionId) -> Result<u64> {
         self.number(
             "SELECT count(*) FROM shapes WHERE collection_id = ?1",
@@ -129,13 +131,13 @@ impl Reader<'_> {
         )
     }
 
-    /// Shapes of a collection whose labels wait to be recomputed.
+    /// Number of stale shapes of a collection.
     pub fn n_stale(&self, collection: CollectionId) -> Result<u64> {
         let sql = "SELECT count(*) FROM shapes WHERE stale AND collection_id = ?1";
         self.number(sql, [collection])
     }
 
-    /// Every shape of a collection by ordinal, with the object that holds its description.
+    /// Every shape of a collection by ordinal, with the object of its description.
     pub fn descriptions(&self, collection: CollectionId) -> Result<Vec<DescriptionRef>> {
         let tail = "WHERE collection_id = ?1 ORDER BY ordinal";
         self.all(&SHAPES, tail, [collection], |fields| {
@@ -165,7 +167,7 @@ impl Reader<'_> {
     }
 
     /// Calls `visit` with the global descriptor of each shape of a collection, in order of their
-    /// ids, without holding them all.
+    /// ids, without loading all of them.
     pub fn each_signature(
         &self,
         collection: CollectionId,
@@ -180,7 +182,7 @@ impl Reader<'_> {
         })
     }
 
-    /// The object file of a digest; `None`: nothing of that name was committed.
+    /// The object file of a digest; `None` if no such file was committed.
     pub fn object(&self, kind: ObjectKind, digest: &Digest) -> Result<Option<ObjectRow>> {
         let tail = "WHERE kind = ?1 AND digest = ?2";
         self.first(&OBJECTS, tail, params![kind, digest], object_row)
@@ -191,7 +193,7 @@ impl Reader<'_> {
         self.all(&OBJECTS, "ORDER BY kind, digest", [], object_row)
     }
 
-    /// Whether there are rows of object files that no shape and no queued item needs.
+    /// Whether there are object files that neither a shape nor a queued item needs.
     pub fn has_unreferenced_objects(&self) -> Result<bool> {
         let sql = format!("SELECT EXISTS (SELECT 1 FROM objects WHERE {UNREFERENCED})");
         Ok(self.number(&sql, [])? > 0)
@@ -215,7 +217,7 @@ impl Reader<'_> {
 }
 
 impl Tx<'_> {
-    /// Commits an object file whose bytes are durable: from here on it exists.
+    /// Commits an object file whose bytes are durable; from now on it exists.
     pub fn insert_object(&self, row: &ObjectRow) -> Result<()> {
         self.execute(
             "INSERT INTO objects (kind, digest, file, length, blake3) VALUES (?1, ?2, ?3, ?4, ?5)
@@ -226,7 +228,8 @@ impl Tx<'_> {
         Ok(())
     }
 
-    /// Deletes the rows of object files that no shape and no queued item needs, and returns the files.
+    /// Deletes the rows of object files that neither a shape nor a queued item needs, and returns
+    /// the files.
     pub fn delete_unreferenced_objects(&self) -> Result<Vec<String>> {
         let sql = format!("DELETE FROM objects WHERE {UNREFERENCED} RETURNING file");
         let mut statement = self.connection().prepare_cached(&sql)?;
@@ -234,7 +237,7 @@ impl Tx<'_> {
         Ok(files.collect::<rusqlite::Result<_>>()?)
     }
 
-    /// Writes the global descriptor of a shape, in the place of one that cannot be read.
+    /// Replaces the global descriptor of a shape, for instance one that cannot be read.
     pub fn put_signature(&self, shape: ShapeId, signature: &[f32]) -> Result<()> {
         self.execute("DELETE FROM shape_signatures WHERE shape_id = ?1", [shape])?;
         let signature = floats_to_blob(signature);
@@ -277,19 +280,21 @@ impl Tx<'_> {
         self.change(&SHAPES, id, "DELETE FROM shapes WHERE id = ?1", [id])
     }
 
-    /// Marks the labels of one shape as waiting to be recomputed, or not.
+    /// Sets whether the labels of one shape are stale.
     pub fn set_stale(&self, id: ShapeId, stale: bool) -> Result<()> {
         let sql = "UPDATE shapes SET stale = ?2 WHERE id = ?1";
         self.change(&SHAPES, id, sql, params![id, stale])
     }
 
-    /// Marks the labels of every shape of a collection as waiting to be recomputed; how many now are.
+    /// Marks the labels of every shape of a collection as stale; returns the number of stale
+    /// shapes.
     pub fn mark_all_stale(&self, collection: CollectionId) -> Result<u64> {
         let sql = "UPDATE shapes SET stale = 1 WHERE collection_id = ?1 AND NOT stale";
         Ok(self.execute(sql, [collection])? as u64)
     }
 
-    /// Marks every shape of a collection whose labels are of an epoch before `epoch`; how many.
+    /// Marks shapes of a collection with labels of an epoch before `epoch` as stale; returns their
+    /// number.
     pub fn mark_stale_before(&self, collection: CollectionId, epoch: u64) -> Result<u64> {
         let sql = "UPDATE shapes SET stale = 1
                    WHERE collection_id = ?1 AND label_epoch < ?2 AND NOT stale";

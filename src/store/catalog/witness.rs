@@ -1,14 +1,15 @@
-//! A small file beside the catalog says how many changes it must at least hold.
+//! Stores the least number of changes that the catalog must contain in a small file beside it.
 //!
-//! Commits are in the write-ahead log until a checkpoint copies them into the catalog's file. A log
-//! that is deleted, cut or exchanged looks to SQLite like one that was never written, and the
-//! catalog like an older one. So every commit is numbered, in a row of `meta`, and after it is
-//! durable its number goes into the witness, which therefore never promises more than is durable.
+//! Commits are in the write-ahead log until a checkpoint copies them into the catalog's file. To
+//! SQLite, a log that was deleted, cut or exchanged looks like one that was never written, and the
+//! catalog like an older one. So every commit is numbered, in a row of `meta`, and its number is
+//! written to the witness once it is durable. Hence the witness never promises more than is
+//! durable.
 //!
-//! The number is written in place and not synced: a process that ends keeps what it wrote, and
-//! after a loss of power the witness may promise less than there is, never more. Checkpoints write
-//! the file anew, synced, and with it how many changes are in the catalog's file alone: fewer there
-//! mean an older file under a newer log.
+//! The number is written in place and not synced: the writes of a process survive its end, and
+//! after a loss of power the witness may promise less than the catalog contains, never more.
+//! Checkpoints rewrite the file, synced, together with the number of changes in the catalog's file
+//! alone: fewer changes there mean an older file under a newer log.
 
 use super::reader::Reader;
 use super::schema;
@@ -24,19 +25,19 @@ use std::path::{Path, PathBuf};
 /// The file, in the library's folder.
 pub(in crate::store) const WITNESS_FILE: &str = "catalog.commits";
 
-/// The row of `meta` that says which library it is.
+/// The row of `meta` with the library's id.
 pub(super) const LIBRARY_ID: &str = "library_id";
 
 /// The row of `meta` that numbers commits.
 pub(super) const COMMITS: &str = "commits";
 
-/// How the file begins.
+/// The beginning of the file.
 const MAGIC: &str = "coseg-commits 1";
 
-/// Reads of a file that may be written meanwhile.
+/// Number of attempts to read a file that another process may be writing.
 const N_LOOKS: usize = 3;
 
-/// What the catalog must at least hold.
+/// The least contents of the catalog.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in crate::store) struct Witness {
     /// The library's id.
@@ -47,28 +48,28 @@ pub(in crate::store) struct Witness {
     pub(in crate::store) committed: u64,
 }
 
-/// What was found in the place of the witness.
+/// The state of the witness file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in crate::store) enum Found {
-    /// None: an older version made the library, or a copy has the catalog alone.
+    /// No file: an older version created the library, or only the catalog was copied.
     Missing,
-    /// Something else; why.
+    /// The file is not a witness; the reason.
     Damaged(String),
-    /// A witness.
+    /// The file is a witness.
     Whole(Witness),
 }
 
-/// How a catalog falls short of its witness.
+/// The difference between a catalog and its witness.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in crate::store) struct Shortfall {
-    /// What happened, in words.
+    /// A description of the loss.
     pub(in crate::store) what: String,
     /// Whether the log does not belong to the catalog's file and must not be used with it.
     pub(in crate::store) foreign_log: bool,
 }
 
 impl Shortfall {
-    /// The error of whoever wanted to open the library.
+    /// The error for opening the library.
     pub(in crate::store) fn refusal(self) -> StoreError {
         StoreError::Damaged {
             path: CATALOG_FILE.into(),
@@ -100,10 +101,10 @@ impl Witness {
         Ok(found)
     }
 
-    /// Writes it, durably, in the place of the one that is there.
+    /// Replaces the witness durably.
     pub(in crate::store) fn write(&self, catalog: &Path) -> Result<(), StoreError> {
         let path = path_of(catalog);
-        // Others may be at it, after checkpoints of theirs.
+        // Other processes may write it, after checkpoints of their own.
         let temporary = path.with_extension(format!("commits.{}", std::process::id()));
         let written = remove_if_there(&temporary)
             .and_then(|()| {
@@ -119,7 +120,8 @@ impl Witness {
         written.map_err(|e| StoreError::io(&path, e))
     }
 
-    /// Removes what processes left that ended while they wrote it. For whoever holds the library, before others write.
+    /// Removes files of processes that ended while they wrote. Call it when holding the library,
+    /// before others write.
     pub(in crate::store) fn tidy(catalog: &Path) -> Result<(), StoreError> {
         let folder = folder_of(catalog);
         let tidied = std::fs::read_dir(folder).and_then(|mut entries| {
@@ -138,15 +140,15 @@ impl Witness {
         tidied.map_err(|e| StoreError::io(folder, e))
     }
 
-    /// Notes that commit `committed` is durable, unless a later one is noted already. Without a whole
-    /// witness of this library there is nothing to note it in.
+    /// Records that commit `committed` is durable, unless a later one is recorded already. Does
+    /// nothing without an intact witness of this library.
     pub(in crate::store) fn advance(catalog: &Path, committed: u64) -> io::Result<()> {
         let opened = File::options()
             .read(true)
             .write(true)
             .open(path_of(catalog));
         let file = match opened {
-            // The next checkpoint makes one.
+            // The next checkpoint creates one.
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
             opened => opened?,
         };
@@ -157,8 +159,8 @@ impl Witness {
         };
         if witness.committed < committed {
             witness.committed = committed;
-            // Of one length always and within one sector, so that a loss of power leaves the old or
-            // the new.
+            // The text has constant length and lies within one sector, so that after a loss of
+            // power either the old or the new text remains.
             file.write_all_at(witness.text().as_bytes(), 0)?;
         }
         Ok(())
@@ -194,19 +196,19 @@ impl Witness {
     }
 }
 
-/// What a catalog says of itself.
+/// The library and the number of commits that a catalog contains.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Said {
     library: String,
     commits: u64,
 }
 
-/// How the catalog at `catalog` falls short of its witness, if it does. Changes nothing, and may be
-/// asked beside a writer.
+/// The difference between the catalog at `catalog` and its witness, if any. It changes no file, and
+/// may run beside a writer.
 ///
-/// What cannot be read for damage falls short of nothing: others find that.
+/// A catalog that damage makes unreadable has no shortfall: other checks find the damage.
 pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, StoreError> {
-    // Before the catalog, which meanwhile may have gained more.
+    // The witness is read before the catalog, which may gain commits meanwhile.
     let Found::Whole(witness) = Witness::read(catalog)? else {
         return Ok(None);
     };
@@ -234,7 +236,7 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
                 alone.library, witness.library
             ));
         }
-        // Its pages are older than the log supposes: together they would be a mixture.
+        // Its pages are older than the log assumes, so together they would be inconsistent.
         if alone.commits < witness.settled {
             return Ok(Some(Shortfall {
                 what: format!(
@@ -265,11 +267,11 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
     Ok(None)
 }
 
-/// What the catalog says, log included; `None` if that cannot be read for damage.
+/// The contents of the catalog, including its log; `None` if damage makes it unreadable.
 fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let has_log = std::fs::metadata(super::log_of(catalog)).is_ok_and(|log| log.len() > 0);
-    // SQLite would make a log where there is none.
+    // SQLite would create a missing log.
     let read = match has_log {
         true => Connection::open_with_flags(catalog, flags)
             .map_err(StoreError::from)
@@ -279,7 +281,7 @@ fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
     match read {
         Ok(said) => Ok(Some(said)),
         Err(e) if e.is_damage() => Ok(None),
-        // Its tables are not those of a catalog, which the check of its format says better.
+        // Its tables are not those of a catalog; the check of its format has a better message.
         Err(StoreError::Catalog(e)) if e.sqlite_error_code() == Some(ErrorCode::Unknown) => {
             Ok(None)
         }
@@ -287,7 +289,7 @@ fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
     }
 }
 
-/// What the catalog's file says without its log: it is read as one that does not change.
+/// The contents of the catalog's file without its log; opened as immutable.
 fn said_by_file_alone(catalog: &Path) -> Result<Said, StoreError> {
     use std::os::unix::ffi::OsStrExt as _;
     let mut uri = String::from("file:");

@@ -1,9 +1,9 @@
-//! The object path under faults and crashes at every operation.
+//! Tests object files under faults and crashes at every operation.
 
 use super::*;
 use crate::store::faulty::{EIO, ENOSPC, Fault, MemDisk};
 
-/// What the tests put: two digests share a folder, one content comes twice.
+/// The contents of the tests: two digests share a folder, and one content occurs twice.
 fn contents() -> Vec<Vec<u8>> {
     let mut contents: Vec<Vec<u8>> = (0..9_u8)
         .map(|i| vec![i; usize::from(i) * 40 + 1].repeat(3))
@@ -53,10 +53,10 @@ fn what_was_put_survives_a_crash_at_every_operation() {
                     "{} lost at {n_logged}, {seed}",
                     row.file
                 );
-                // A file in its place is complete, acknowledged or not.
+                // A file with a final name is complete, whether acknowledged or not.
                 assert!(there || !image.exists(&Path::new("/l").join(&row.file)));
             }
-            // Starts unaided, and doing it all again gives the same.
+            // The store opens without help, and repeating all operations gives the same result.
             let objects = opened(&image).expect("opens");
             for (_, row, bytes) in &acknowledged {
                 assert_eq!(*objects.put_original(bytes).expect("stored"), **row);
@@ -64,7 +64,7 @@ fn what_was_put_survives_a_crash_at_every_operation() {
             let again = image.after_crash(image.n_logged(), 0);
             let survivors = acknowledged.iter().filter(|(at, ..)| *at > n_logged);
             for (_, row, bytes) in survivors {
-                // The second log begins at the image, so only what was written anew is in it.
+                // The second log begins at the image, so it contains only the repeated writes.
                 assert!(whole(&image, row, bytes));
                 let in_second = again.exists(&Path::new("/l").join(&row.file));
                 assert!(!in_second || whole(&again, row, bytes));
@@ -75,7 +75,7 @@ fn what_was_put_survives_a_crash_at_every_operation() {
     assert!(n_images >= 2_000, "{n_images}");
 }
 
-/// Puts everything, a fault at operation `fault.at`; then once more without the fault.
+/// Stores everything with a fault at operation `fault.at`, then again without the fault.
 fn run_with(fault: Fault) {
     let disk = Arc::new(MemDisk::new());
     disk.set_fault(Some(fault));
@@ -132,7 +132,7 @@ fn run_with(fault: Fault) {
         }
     }
     assert_eq!(disk.n_retried_syncs(), 0, "{fault:?}");
-    // A fault that made it stop is over for the next process.
+    // A new process does not inherit the fault that stopped the previous one.
     disk.restart();
     let next = opened(&disk).expect("opens");
     for bytes in contents() {
@@ -232,7 +232,7 @@ fn opened_files_stay_mapped_within_the_bound() {
         rows.iter().map(cached).collect::<Vec<_>>(),
         [true, false, true, false]
     );
-    // A row with another digest never gets what an earlier one opened.
+    // A row with another digest never gets the mapping of an earlier one.
     let other = ObjectRow {
         blake3: rows[1].blake3,
         ..ObjectRow::clone(&rows[0])
