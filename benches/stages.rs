@@ -1,6 +1,6 @@
-//! How fast the stages of the pipeline are: `cargo bench -p coseg --bench stages`, with a word
-//! after `--` for those whose names contain it. One thread, except where a stage takes rayon's pool
-//! of its own accord; the shapes are made here.
+//! Times the stages of the pipeline: `cargo bench -p coseg --bench stages`, with a word after `--`
+//! to run only those whose names contain it. One thread, except where a stage uses rayon's pool
+//! itself; the shapes are generated here.
 
 use coseg::labels::{DiscoveryOptions, LabelModel};
 use coseg::mesh::{Format, write};
@@ -11,14 +11,14 @@ use coseg::pipeline::{
 use coseg::synth::{Family, Options, family};
 use divan::Bencher;
 
-/// Labels of a chair: seat, back, legs, arms.
+/// Number of labels of a chair: seat, back, legs, arms.
 const N_LABELS: usize = 4;
 
 fn main() {
     divan::main();
 }
 
-/// Files of chairs with so many faces each.
+/// Files of chairs with `n_faces` faces each.
 fn chairs(count: u32, n_faces: u32) -> Vec<String> {
     let options = Options {
         n_faces,
@@ -33,7 +33,7 @@ fn described(file: &str) -> Description {
     describe(file.as_bytes(), Format::Off, &params, &|_| true).expect("a made chair")
 }
 
-/// A collection of chairs whose labels were discovered.
+/// A collection of chairs with discovered labels.
 struct Collection {
     shapes: Vec<Description>,
     found: Reclustering,
@@ -79,7 +79,7 @@ fn options(next_label: u32) -> ReclusterOptions {
     }
 }
 
-/// From the bytes of a file to a description, by the number of faces.
+/// Times the description from the bytes of a file, by the number of faces.
 #[divan::bench(args = [5_000, 50_000], sample_count = 7, sample_size = 1)]
 fn describe_a_file(bencher: Bencher<'_, '_>, n_faces: u32) {
     let file = chairs(1, n_faces).remove(0);
@@ -123,7 +123,7 @@ fn label_without_maps(bencher: Bencher<'_, '_>) {
     bencher.bench_local(|| label(&view, &prepared, collection.model(), &[]));
 }
 
-/// Clusters the parts of eight chairs again, against the labels that they have.
+/// Re-clusters the parts of eight chairs, and compares with their present labels.
 #[divan::bench(sample_count = 3, sample_size = 1)]
 fn recluster_eight(bencher: Bencher<'_, '_>) {
     let collection = Collection::new(8);

@@ -1,4 +1,5 @@
-//! Made chairs become a library with labels, without a daemon: `cargo run --release --example library`.
+//! Builds a library of generated chairs with labels, without a daemon: `cargo run --release
+//! --example library`.
 
 use coseg::library::{CollectionSpec, NewShape, Up};
 use coseg::mesh::{Format, write::off};

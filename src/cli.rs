@@ -14,6 +14,7 @@ use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
 use crate::commands::synth::SynthArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use coseg::ipc::convert::parse_up;
 use coseg::ipc::wire;
 use coseg::library::MAX_PARTS;
 use coseg::operators;
@@ -277,7 +278,7 @@ pub(crate) struct Settings {
     #[arg(long, value_name = "N", value_parser = parts, allow_hyphen_values = true)]
     pub(crate) parts: Option<u32>,
     /// The axis that points up in every file: +x -x +y -y +z -z unknown auto [default: unknown]
-    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+    #[arg(long, value_name = "AXIS", value_parser = parse_up, allow_hyphen_values = true)]
     pub(crate) up: Option<wire::Up>,
     /// The Laplacian [default: tufted]
     #[arg(long, value_name = "OPERATOR")]
@@ -310,20 +311,6 @@ pub(crate) fn parts(text: &str) -> Result<u32, String> {
         Ok(n) if n <= MAX_PARTS => Ok(n),
         _ => Err(why.to_owned()),
     }
-}
-
-pub(crate) fn up(text: &str) -> Result<wire::Up, String> {
-    Ok(match text.to_ascii_lowercase().as_str() {
-        "+x" | "x" => wire::Up::PlusX,
-        "-x" => wire::Up::MinusX,
-        "+y" | "y" => wire::Up::PlusY,
-        "-y" => wire::Up::MinusY,
-        "+z" | "z" => wire::Up::PlusZ,
-        "-z" => wire::Up::MinusZ,
-        "unknown" => wire::Up::Unknown,
-        "auto" => wire::Up::Auto,
-        _ => return Err("expected one of +x -x +y -y +z -z unknown auto".to_owned()),
-    })
 }
 
 /// A Laplacian.
@@ -543,7 +530,7 @@ pub(crate) enum Collections {
         /// The collection
         name: String,
         /// The axis that points up in every file: +x -x +y -y +z -z unknown auto
-        #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+        #[arg(long, value_name = "AXIS", value_parser = parse_up, allow_hyphen_values = true)]
         up: wire::Up,
         /// Return once the axis is set, before the shapes are labelled again
         #[arg(long)]

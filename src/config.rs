@@ -110,8 +110,8 @@ impl Http {
             .map_err(|_| refuse(format!("{:?} is not IP-ADDRESS:PORT", self.listen)))?;
         if !address.ip().is_loopback() && !self.allow_remote {
             return Err(refuse(format!(
-                "{address} is not loopback; set http.allow_remote if other machines are to reach it: it asks for \
-                 a token, but does not encrypt"
+                "{address} is not loopback; set http.allow_remote if other machines are to reach \
+                 it: it asks for a token, but does not encrypt"
             )));
         }
         Ok(Some(address))

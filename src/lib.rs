@@ -24,6 +24,7 @@ pub mod synth;
 // Shell: modules that use files, sockets and clocks.
 pub mod store;
 pub mod library;
+pub mod text;
 pub mod ipc;
 pub mod config;
 pub mod viewer;

@@ -37,7 +37,8 @@ impl SignatureMetric {
         sum.sqrt()
     }
 
-    /// The `limit` nearest of `known`, as (index, distance), nearest first; ties go to the lower index.
+    /// The `limit` nearest of `known`, as (index, distance), nearest first; ties go to the lower
+    /// index.
     pub fn nearest<'a>(
         &self,
         signature: &[f32],

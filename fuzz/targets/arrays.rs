@@ -1,4 +1,5 @@
-//! The bytes of an array file, without a digest to catch what is wrong with them: opened or refused, and safe to index.
+//! The bytes of an array file, without a digest to catch what is wrong with them: opened or
+//! refused, and safe to index.
 #![no_main]
 
 use coseg::store::mapped::MappedDescription;

@@ -1,4 +1,5 @@
-//! Bytes of a mesh file, in the format that `COSEG_FUZZ_FORMAT` names: parsed or refused, and cleaned or refused.
+//! Bytes of a mesh file, in the format that `COSEG_FUZZ_FORMAT` names: parsed or refused, and
+//! cleaned or refused.
 #![no_main]
 
 use coseg::mesh::{self, Format};

@@ -1,4 +1,5 @@
-//! A request as a client may send it, written as tests/golden has it: header and frames, each after its length.
+//! A request as a client may send it, written as tests/golden has it: header and frames, each after
+//! its length.
 #![no_main]
 
 use bytes::Bytes;

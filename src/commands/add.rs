@@ -14,6 +14,7 @@ use coseg::ipc::client::unexpected;
 use coseg::ipc::convert::mesh_format;
 use coseg::ipc::size;
 use coseg::ipc::wire::{self, ItemState, reply, request, shape_input::Source};
+use coseg::text::counted;
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::collections::{HashMap, VecDeque};
@@ -169,10 +170,12 @@ fn send(
 fn left_behind(collection: &str, jobs: &VecDeque<(u64, usize)>) -> String {
     let n: usize = jobs.iter().map(|(_, n)| n).sum();
     let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
-    let ids = ids.join(" ");
+    let (shapes, ids) = (counted(n as u64, "shape"), ids.join(" "));
+    let which = if jobs.len() == 1 { "job" } else { "jobs" };
     format!(
-        "coseg: interrupted; the daemon goes on with what it accepted: up to {n} shapes of {collection:?}, jobs {ids}\n  \
-         to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel {ids}\n  \
+        "coseg: interrupted; the daemon continues with the accepted work: up to {shapes} of \
+         {collection:?}, {which} {ids}\n  to follow: coseg wait -c {collection:?}\n  to cancel: \
+         coseg cancel {ids}\n  \
          to add the rest: the same command again"
     )
 }
@@ -231,8 +234,9 @@ fn accepted(
         }))?;
     } else {
         let ids: Vec<String> = jobs.iter().map(|(id, _)| id.to_string()).collect();
-        let ids = ids.join(" ");
-        eprintln!("{n} shapes accepted into {collection}, jobs {ids}");
+        let (shapes, ids) = (counted(n as u64, "shape"), ids.join(" "));
+        let which = if jobs.len() == 1 { "job" } else { "jobs" };
+        eprintln!("{shapes} accepted into {collection}, {which} {ids}");
     }
     Ok(n_failed == 0)
 }
@@ -267,8 +271,9 @@ impl Report {
                 format!("{}: {outcome}", item.name)
             } else {
                 format!(
-                    "{}: {outcome}, {} maps, {seconds:.2} s",
-                    item.name, p.n_maps
+                    "{}: {outcome}, {}, {seconds:.2} s",
+                    item.name,
+                    counted(p.n_maps.into(), "map")
                 )
             };
             self.bar.suspend(|| super::session::print_line(&line))?;

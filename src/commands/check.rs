@@ -7,6 +7,7 @@ use crate::cli::{Check, Global, Restore, Snapshot};
 use coseg::Library;
 use coseg::config::{Config, Overrides};
 use coseg::store::check::Finding;
+use coseg::text::counted;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -42,9 +43,9 @@ pub(crate) fn restore(args: &Restore, global: &Global) -> Outcome {
 fn copy(from: &Path, to: &Path, link: bool, as_json: bool) -> Outcome {
     let copied = Library::copy(from, to, link)?;
     eprintln!(
-        "{}: {} files, {}",
+        "{}: {}, {}",
         to.display(),
-        copied.n_files,
+        counted(copied.n_files, "file"),
         coseg::ipc::size::in_words(copied.n_bytes)
     );
     report(to, &copied.findings, None, as_json)

@@ -5,7 +5,9 @@ use super::session::Session;
 use super::{Outcome, json};
 use crate::cli::Collections;
 use coseg::call;
+use coseg::ipc::convert::up_name;
 use coseg::ipc::wire;
+use coseg::text::counted;
 use serde_json::json;
 
 pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
@@ -36,8 +38,8 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
                 value["changed"] = done.changed.into();
                 session.print_json(&value)?;
             } else {
-                let axis = json::up(*up);
-                let undo = format!("`coseg undo -c {name}` takes this back");
+                let axis = up_name(*up);
+                let undo = format!("`coseg undo -c {name}` undoes this");
                 eprintln!(
                     "{}",
                     match done.changed {
@@ -51,7 +53,11 @@ pub(crate) fn run(command: &Collections, mut session: Session) -> Outcome {
         Collections::Delete { name, yes } => {
             let about = session.describe(name)?;
             let n_labels = about.labels.iter().filter(|l| l.n_shapes > 0).count();
-            let with = format!("{} shapes and {n_labels} labels", about.n_shapes);
+            let with = format!(
+                "{} and {}",
+                counted(about.n_shapes, "shape"),
+                counted(n_labels as u64, "label")
+            );
             let question =
                 format!("Delete {name} with its {with}, and all corrections? It cannot be undone.");
             if !confirmed(&question, *yes)? {
@@ -85,7 +91,7 @@ pub(crate) fn warn_of_up(c: &wire::Collection) {
 pub(crate) fn up_warning(c: &wire::Collection) -> Option<String> {
     let other = c.up_disagrees.as_ref()?;
     let spec = c.spec.as_ref()?;
-    let (given, axis) = (json::up(spec.up()), json::up(other.up()));
+    let (given, axis) = (up_name(spec.up()), up_name(other.up()));
     let percent = 100.0 * other.agreement;
     let name = &spec.name;
     let word = |c: char| c.is_alphanumeric() || "-_.".contains(c);
@@ -94,8 +100,8 @@ pub(crate) fn up_warning(c: &wire::Collection) -> Option<String> {
         false => format!("'{}'", name.replace('\'', r"'\''")),
     };
     Some(format!(
-        "{name} was given up {given}, but {percent:.0} % of its shapes stand along {axis}; if they do, \
-         `coseg collections set {quoted} --up {axis}` finds the labels again"
+        "{name} was given up {given}, but {percent:.0} % of its shapes stand along {axis}; if \
+         they do, `coseg collections set {quoted} --up {axis}` finds the labels again"
     ))
 }
 

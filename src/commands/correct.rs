@@ -7,6 +7,7 @@ use bytes::Bytes;
 use coseg::call;
 use coseg::ipc::frames::FrameWriter;
 use coseg::ipc::wire::{self, correct_labels_request::Correction};
+use coseg::text::counted;
 use serde_json::json;
 
 pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
@@ -23,10 +24,11 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             let n_faces = shape.unwrap_or_default().n_polygons;
             if labels.len() as u64 != n_faces {
                 return Err(CommandError::Failed(format!(
-                    "{} has {} labels, but shape {:?} has {n_faces} faces",
+                    "{} has {}, but shape {:?} has {}",
                     path.display(),
-                    labels.len(),
-                    args.shape
+                    counted(labels.len() as u64, "label"),
+                    args.shape,
+                    counted(n_faces, "face")
                 )));
             }
             Correction::Labels(frames.i32_array(&labels, &[labels.len()]))
@@ -59,16 +61,16 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             "job_id": done.job_id,
         }))?;
     } else {
-        let carried = if args.no_wait {
-            "to be carried"
+        let propagated = if args.no_wait {
+            "to be propagated"
         } else {
-            "carried"
+            "propagated"
         };
         eprintln!(
-            "{}: {:.1} % of its area changed; {carried} to {} shapes",
+            "{}: {:.1} % of its area changed; {propagated} to {}",
             args.shape,
             100.0 * done.changed_share,
-            done.n_stale
+            counted(done.n_stale, "shape")
         );
     }
     Ok(true)

@@ -4,7 +4,7 @@
 //! The daemon runs in this process, but every byte goes through its socket, as between two
 //! programs.
 
-use super::session::{Session, print_line, table};
+use super::session::{Session, print_line};
 use super::{CommandError, Outcome, demo_ply, json, labels};
 use crate::cli::{Global, Settings, parts};
 use crate::telemetry;
@@ -17,6 +17,7 @@ use coseg::ipc::wire::{self, ItemState, reply, request, shape_input::Source};
 use coseg::labels::score::{Score, ScoredShape, score};
 use coseg::mesh::write::off;
 use coseg::synth::{Family, LEAST_FACES, Labelled, Options};
+use coseg::text::table;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::os::unix::fs::DirBuilderExt as _;
@@ -35,7 +36,12 @@ pub(crate) struct DemoArgs {
     #[arg(default_value = "pliers")]
     family: Family,
     /// Number of shapes
-    #[arg(long, value_name = "N", default_value_t = 12, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 12,
+        value_parser = clap::value_parser!(u32).range(1..=1000)
+    )]
     count: u32,
     /// Seed that selects the members of the family
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -114,9 +120,9 @@ pub(crate) fn run(args: &DemoArgs, global: &Global) -> Outcome {
         let (family, n, n_faces) = (args.family, shapes.len(), args.faces);
         let names = args.family.label_names().join(", ");
         session.line(&format!(
-            "family {family}: {n} shapes of {n_faces} faces, made in {made_seconds:.1} s"
+            "family {family}: {n} shapes of {n_faces} faces, generated in {made_seconds:.1} s"
         ))?;
-        session.line(&format!("parts it has: {names}"))?;
+        session.line(&format!("its parts: {names}"))?;
         session.line(&format!(
             "daemon: {}, an empty library in {}",
             running.endpoint(),
@@ -385,14 +391,14 @@ fn summary(
     }
     let mean = sent.iter().map(|s| s.seconds).sum::<f64>() / sent.len() as f64;
     print_line(&format!(
-        "\n{mean:.2} s a shape, from sending the file to durable labels"
+        "\n{mean:.2} s for each shape, from sending the file to durable labels"
     ))?;
     print_line(&format!(
         "accuracy {:.3} (each shape as labelled on arrival: {:.3}), {} labels for {} parts",
         last.accuracy, on_arrival.accuracy, last.n_predicted_labels, last.n_true_labels
     ))?;
     print_line(&format!(
-        "coloured meshes: {} (all.ply: all of them, known parts behind found ones)",
+        "coloured meshes: {} (all.ply: all of them, with the known parts behind the found ones)",
         out.display()
     ))
 }

@@ -41,7 +41,12 @@ pub(crate) struct Describe {
     #[arg(long, value_name = "N", conflicts_with = "full")]
     pub(crate) working_faces: Option<u32>,
     /// Number of threads; the result does not depend on it
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 1,
+        value_parser = clap::value_parser!(u32).range(1..=256)
+    )]
     pub(crate) threads: u32,
     /// Print the milliseconds of each stage; with --full also of each step of the solver
     #[arg(long)]
@@ -314,10 +319,12 @@ fn proof(certificate: &Certificate) -> String {
     let counted = format!("{count} eigenvalues below {tau:.6} by inertia, and as many found");
     match certificate.proved() {
         true => format!(
-            "complete, proved: {counted}; rounding moves them by {perturbation:.1e} at most, the margin is {margin:.1e}"
+            "complete, proved: {counted}; rounding moves them by {perturbation:.1e} at most, the \
+             margin is {margin:.1e}"
         ),
         false => format!(
-            "complete, counted but not proved: {counted}; in the worst case rounding moves them by {perturbation:.1e}, more than the margin of {margin:.1e}"
+            "complete, counted but not proved: {counted}; in the worst case rounding moves them \
+             by {perturbation:.1e}, more than the margin of {margin:.1e}"
         ),
     }
 }

@@ -11,6 +11,7 @@ use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
 use coseg::mesh::write::{glb, mtl, npy, obj, ply, seg, usda};
 use coseg::mesh::{ParsedMesh, parse};
+use coseg::text::counted;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -72,7 +73,8 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         session
             .print_json(&json!({ "collection": collection, "format": format, "files": written }))?;
     } else {
-        eprintln!("{} shapes written to {}", shapes.len(), args.out.display());
+        let shapes = counted(shapes.len() as u64, "shape");
+        eprintln!("{shapes} written to {}", args.out.display());
     }
     Ok(true)
 }
@@ -177,7 +179,7 @@ pub(super) fn original(
     if mesh.n_polygons != n_labels {
         let n = mesh.n_polygons;
         return Err(bad(format!(
-            "{shape} has {n} faces, but {n_labels} labels, by an earlier release: add it again with \
+            "{shape} has {n} faces, but {n_labels} labels by an earlier release: add it again with \
              --replace"
         )));
     }

@@ -1,12 +1,14 @@
 //! `coseg jobs` lists jobs and failures, `coseg retry` queues failed shapes again, and `coseg
 //! cancel` cancels shapes.
 
-use super::session::{Session, table};
+use super::session::Session;
 use super::{CommandError, Outcome, interrupt};
 use crate::cli::{Cancel, Jobs, Retry};
 use coseg::call;
 use coseg::ipc::wire::{self, ItemState};
 use coseg::library::shown;
+use coseg::text::counted;
+use coseg::text::table;
 use serde_json::{Value, json};
 
 pub(crate) fn jobs(args: &Jobs, mut session: Session) -> Outcome {
@@ -87,8 +89,8 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
     if !args.no_wait && !job.finished {
         let id = args.job;
         interrupt::say(format!(
-            "coseg: interrupted; the daemon goes on with job {id}\n  to follow: coseg wait -c {:?}\n  \
-             to cancel: coseg cancel {id}",
+            "coseg: interrupted; the daemon continues with job {id}\n  to follow: coseg wait -c \
+             {:?}\n  to cancel: coseg cancel {id}",
             job.collection
         ));
     }
@@ -107,7 +109,7 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
         for item in &failed {
             eprintln!("{}: {}", shown(&item.name), why(item));
         }
-        eprintln!("{} shapes were queued again", reply.n_queued);
+        eprintln!("queued {} again", counted(reply.n_queued, "shape"));
     }
     if reply.n_queued == 0 && !session.json {
         return Err(CommandError::Failed(format!(

@@ -1,6 +1,6 @@
 //! `coseg keys` generates keys and manages the list of clients that may connect.
 
-use super::session::{print_line, table};
+use super::session::print_line;
 use super::{CommandError, Outcome};
 use crate::cli::{Global, Keys, KeysCommand};
 use coseg::config::{Config, Overrides};
@@ -8,6 +8,7 @@ use coseg::ipc::keys::{
     ALLOW_FILE, AllowList, Allowed, KeyPair, PublicKey, SERVER_KEY_FILE, SERVER_PUBLIC_FILE,
     check_name, read_public, write_public,
 };
+use coseg::text::table;
 use serde_json::json;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
@@ -72,7 +73,7 @@ pub(crate) fn run(args: &Keys, global: &Global) -> Outcome {
             if global.json {
                 print_line(&json!({ "revoked": gone.name, "key": gone.key.as_str() }).to_string())?;
             } else {
-                eprintln!("{} may not connect any more", gone.name);
+                eprintln!("{} may no longer connect", gone.name);
             }
         }
     }
@@ -135,7 +136,7 @@ fn tell(client: &Allowed, file: Option<&Path>, as_json: bool) -> Result<(), Comm
     print_line(client.key.as_str())?;
     eprintln!("{} may connect, with the role {}", client.name, client.role);
     if let Some(file) = file {
-        eprintln!("give {file} to the client, and nobody else: COSEG_CLIENT_KEY");
+        eprintln!("give {file} to the client, and to nobody else: COSEG_CLIENT_KEY");
     }
     Ok(())
 }

@@ -29,12 +29,12 @@ fn labels_of(bytes: &[u8]) -> Result<Vec<i32>, String> {
 }
 
 /// Converts a number to a label; `location` describes its position in messages.
-fn label(number: i64, place: impl Fn() -> String) -> Result<i32, String> {
+fn label(number: i64, location: impl Fn() -> String) -> Result<i32, String> {
     match i32::try_from(number) {
         Ok(label) if (-1..=i64::from(MAX_LABEL)).contains(&number) => Ok(label),
         _ => Err(format!(
             "{} is {number}, but must be -1 to {MAX_LABEL}",
-            place()
+            location()
         )),
     }
 }
@@ -43,11 +43,11 @@ fn label(number: i64, place: impl Fn() -> String) -> Result<i32, String> {
 fn from_text(text: &str) -> Result<Vec<i32>, String> {
     let labels = text.trim_end().lines().enumerate().map(|(i, line)| {
         let word = line.trim();
-        let place = || format!("line {}", i + 1);
+        let location = || format!("line {}", i + 1);
         let number: i64 = word
             .parse()
-            .map_err(|_| format!("{} is {word:?}, but must be an integer", place()))?;
-        label(number, place)
+            .map_err(|_| format!("{} is {word:?}, but must be an integer", location()))?;
+        label(number, location)
     });
     labels.collect()
 }
@@ -68,15 +68,15 @@ fn from_npy(bytes: &[u8]) -> Result<Vec<i32>, String> {
 
 /// A list of labels, or an object that has one under `labels`.
 fn from_json(text: &str) -> Result<Vec<i32>, String> {
-    let value: Value = serde_json::from_str(text).map_err(|e| format!("it is no JSON: {e}"))?;
+    let value: Value = serde_json::from_str(text).map_err(|e| format!("it is not JSON: {e}"))?;
     let list = value.as_array().or_else(|| value.get("labels")?.as_array());
     let list = list.ok_or("its JSON has no list \"labels\"")?;
     let labels = list.iter().enumerate().map(|(i, value)| {
-        let place = || format!("the label of face {i}");
+        let location = || format!("the label of face {i}");
         let number = value.as_i64();
         label(
-            number.ok_or_else(|| format!("{} is {value}, but must be an integer", place()))?,
-            place,
+            number.ok_or_else(|| format!("{} is {value}, but must be an integer", location()))?,
+            location,
         )
     });
     labels.collect()
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_label_is_named_with_its_place_and_the_limit() {
+    fn what_is_no_label_is_named_with_its_location_and_the_limit() {
         let message = |bytes: &[u8]| labels_of(bytes).unwrap_err();
         for (text, wanted) in [
             ("1\nx\n", "line 2 is \"x\", but must be an integer"),

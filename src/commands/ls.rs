@@ -1,11 +1,13 @@
 //! `coseg ls` lists collections, or the shapes of one.
 
 use super::collections::warn_of_up;
-use super::session::{Session, table};
+use super::session::Session;
 use super::{Outcome, json};
 use crate::cli::Ls;
 use coseg::call;
+use coseg::ipc::convert::up_name;
 use coseg::ipc::wire;
+use coseg::text::table;
 use serde_json::{Value, json};
 
 pub(crate) fn run(args: &Ls, mut session: Session) -> Outcome {
@@ -49,7 +51,7 @@ fn collections(session: &mut Session) -> Outcome {
             c.n_stale.to_string(),
             n_labels.to_string(),
             parts.map_or_else(|| "estimated".to_owned(), |n| n.to_string()),
-            json::up(spec.up()).to_owned(),
+            up_name(spec.up()).to_owned(),
             c.sequence.to_string(),
         ]);
     }

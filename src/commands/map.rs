@@ -1,11 +1,12 @@
 //! `coseg map` shows the functional map between two shapes, and the parts that it matches.
 
 use super::render::pair;
-use super::session::{Session, table};
+use super::session::Session;
 use super::{CommandError, Outcome, json};
 use crate::cli::Map;
 use coseg::call;
 use coseg::ipc::wire::{self, ArrayRef, DataType};
+use coseg::text::table;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use serde_json::json;
@@ -83,7 +84,8 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
     }
     let size: Vec<String> = shape.iter().map(u64::to_string).collect();
     session.line(&format!(
-        "{} to {}: c_12 ({}), descriptor residual {:.3}, orthogonality {:.3}, coverage {:.2}, near zero {:.2}",
+        "{} to {}: c_12 ({}), descriptor residual {:.3}, orthogonality {:.3}, coverage {:.2}, \
+         near zero {:.2}",
         args.from,
         args.to,
         size.join(", "),
@@ -145,12 +147,12 @@ pub(super) fn options(landmarks: &[(u32, u32)], mirrored: bool) -> wire::PointMa
 /// The share with a counterpart, and the expected accuracy of transferred labels.
 pub(super) fn match_line(q: &wire::MapQuality) -> String {
     let mut line = format!(
-        "something corresponds to {:.1} % of the second",
+        "{:.1} % of the second shape has a counterpart",
         100.0 * q.matched()
     );
     if let Some(confidence) = q.confidence {
         line += &format!(
-            "; a carried label is expected to be right on {:.1} %",
+            "; a transferred label is expected to be right on {:.1} %",
             100.0 * confidence
         );
     }
@@ -161,13 +163,15 @@ pub(super) fn match_line(q: &wire::MapQuality) -> String {
 fn agreement_line(a: &wire::MapAgreement) -> String {
     let (n, departure) = (a.n_triangles, a.departure);
     match (n, a.inconsistent) {
-        (0 | 1, _) => format!("triangles with other maps: {n}, too few to say whether it agrees"),
+        (0 | 1, _) => {
+            format!("triangles with other maps: {n}, too few to decide whether it agrees")
+        }
         (_, false) => {
             format!("agrees with other maps around {n} triangles (departure {departure:.2})")
         }
         (_, true) => format!(
             "does not agree with other maps around {n} triangles (departure {departure:.2}); \
-             coseg check --repair makes it anew"
+             coseg check --repair recomputes it"
         ),
     }
 }
@@ -185,7 +189,8 @@ fn point_line(q: &wire::MapQuality, alternative: Option<f64>) -> String {
         None => "no map of the other orientation was found".to_owned(),
     };
     format!(
-        "{turned} orientation ({orientation:.2}), round trip {:.3}, smoothness {:.2}, error to expect {:.3} of the root of the area; {other}",
+        "{turned} orientation ({orientation:.2}), round trip {:.3}, smoothness {:.2}, expected \
+         error {:.3} of the root of the area; {other}",
         q.round_trip(),
         q.smoothness(),
         q.expected_error(),

@@ -5,6 +5,7 @@ use super::{Outcome, json};
 use crate::cli::{Merge, Split};
 use coseg::call;
 use coseg::ipc::wire;
+use coseg::text::counted;
 use serde_json::json;
 
 pub(crate) fn merge(args: &Merge, mut session: Session) -> Outcome {
@@ -21,7 +22,8 @@ pub(crate) fn merge(args: &Merge, mut session: Session) -> Outcome {
         let label = json::label(&done.label.unwrap_or_default());
         session.print_json(&json!({ "label": label, "n_shapes": done.n_shapes }))?;
     } else {
-        eprintln!("label {label} is {into} now, on {} shapes", done.n_shapes);
+        let shapes = counted(done.n_shapes, "shape");
+        eprintln!("label {label} is {into} now, on {shapes}");
     }
     Ok(true)
 }

@@ -193,9 +193,11 @@ mod tests {
             "accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3"}},
             {{"bufferView":1,"componentType":5121,"count":6,"type":"SCALAR"}},
             {{"bufferView":2,"componentType":5126,"count":1,"type":"SCALAR"}}],
-            "bufferViews":[{{"buffer":0,"byteLength":48}},{{"buffer":2,"byteOffset":1,"byteLength":6}},
+            "bufferViews":[{{"buffer":0,"byteLength":48}},
+                {{"buffer":2,"byteOffset":1,"byteLength":6}},
             {{"buffer":1,"byteLength":4}}],
-            "buffers":[{{"byteLength":48,"uri":"{positions}"}},{{"byteLength":4,"uri":"missing.bin"}},
+            "buffers":[{{"byteLength":48,"uri":"{positions}"}},
+                {{"byteLength":4,"uri":"missing.bin"}},
             {{"byteLength":7,"uri":"{indices}"}}]}}"#
         )
     }

@@ -73,7 +73,7 @@ impl Found {
             match first.get(&file.name) {
                 Some(other) => {
                     let why = format!(
-                        "would be named {:?}, as {} is, which was there first; rename one of them",
+                        "would be named {:?}, as {} is, which comes first; rename one of them",
                         file.name,
                         other.display()
                     );
@@ -110,7 +110,8 @@ impl Search {
         let (path, known) = (path.display(), Format::EXTENSIONS);
         match below {
             Some(mesh) if is_empty => Err(CommandError::Usage(format!(
-                "{path} itself has no mesh files ({known}), but its subfolders have, such as {}: add --recursive",
+                "{path} itself has no mesh files ({known}), but its subfolders have, such as {}: \
+                 add --recursive",
                 mesh.display()
             ))),
             None if is_empty => {

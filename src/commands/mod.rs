@@ -127,7 +127,7 @@ impl CommandError {
     pub(crate) fn advice(&self) -> Option<&'static str> {
         let refusal = match self {
             Self::Client(ClientError::NoAnswer { .. }) => {
-                return Some("start one with `coseg serve`, or say where it is with --endpoint");
+                return Some("start one with `coseg serve`, or give its address with --endpoint");
             }
             Self::Client(ClientError::Refused(e)) => e,
             _ => return None,
@@ -139,7 +139,7 @@ impl CommandError {
                 "`coseg show --collection NAME` lists the labels"
             }
             ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
-            ErrorReason::Draining => "start the daemon again; it takes up what it had accepted",
+            ErrorReason::Draining => "start the daemon again; it resumes the accepted work",
             ErrorReason::ReadOnly | ErrorReason::Damaged => {
                 "look at the daemon's log, then run `coseg check`"
             }

@@ -1,10 +1,11 @@
 //! `coseg nearest` lists the shapes most similar to one shape.
 
 use super::Outcome;
-use super::session::{Session, table};
+use super::session::Session;
 use crate::cli::Nearest;
 use coseg::call;
 use coseg::ipc::wire;
+use coseg::text::table;
 use serde_json::json;
 
 pub(crate) fn run(args: &Nearest, mut session: Session) -> Outcome {

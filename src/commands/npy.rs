@@ -22,13 +22,13 @@ pub(crate) struct Array {
 
 /// Parses the array in a file; the error describes the fault.
 pub(crate) fn read(bytes: &[u8]) -> Result<Array, String> {
-    let short = || "the file ends within its heading".to_owned();
+    let short = || "the file ends within its header".to_owned();
     let major = *bytes.get(6).ok_or_else(short)?;
     let (at, length) = match (major, bytes.get(8..12)) {
         (1, Some(n)) => (10_usize, usize::from(u16::from_le_bytes([n[0], n[1]]))),
         (2 | 3, Some(n)) => (12, u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize),
         (_, None) => return Err(short()),
-        _ => return Err(format!("version {major} of the format is not known")),
+        _ => return Err(format!("version {major} of the format is unknown")),
     };
     let heading = bytes.get(at..at.saturating_add(length)).ok_or_else(short)?;
     let heading = String::from_utf8_lossy(heading);
@@ -58,7 +58,7 @@ pub(crate) fn read(bytes: &[u8]) -> Result<Array, String> {
     };
     let rows_first = after("fortran_order").is_some_and(|t| t.starts_with("False"));
     if !rows_first && n_columns.is_some_and(|n| n > 1) {
-        return Err("columns come first; save it with rows first".to_owned());
+        return Err("columns come first; save it in row-major order".to_owned());
     }
     let count = extents.iter().try_fold(1usize, |n, e| n.checked_mul(*e));
     Ok(Array {
@@ -79,9 +79,7 @@ fn elements(kind: &str, data: &[u8], count: Option<usize>) -> Result<Elements, S
     let size = usize::from(size - b'0');
     if count.and_then(|n| n.checked_mul(size)) != Some(data.len()) {
         let n = data.len();
-        return Err(format!(
-            "{n} bytes of data, which is not what its heading says"
-        ));
+        return Err(format!("{n} bytes of data, which contradicts its header"));
     }
     // Converts an element to eight bytes, lowest first, extended by `fill`.
     let word = |element: &[u8], fill: fn(u8) -> u8| -> [u8; 8] {

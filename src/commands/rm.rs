@@ -50,9 +50,7 @@ fn question(shapes: &[String], collection: &str) -> String {
     if shapes.len() > NAMED {
         names.push_str(&format!(" and {} more", shapes.len() - NAMED));
     }
-    format!(
-        "Remove {names} from {collection}, with what was corrected on them? It cannot be undone."
-    )
+    format!("Remove {names} from {collection}, with their corrections? It cannot be undone.")
 }
 
 #[cfg(test)]

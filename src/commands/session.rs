@@ -9,9 +9,10 @@ use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
 use coseg::ipc::wire;
 use coseg::library::likely::{did_you_mean, likeliest};
 use coseg::library::shown;
+use coseg::text::counted;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::Value;
-use std::io::{IsTerminal as _, Write as _};
+use std::io::IsTerminal as _;
 use std::time::Duration;
 
 /// Longest single wait in the daemon, so that an answer arrives well within the timeout.
@@ -183,14 +184,16 @@ impl Session {
             }
             let bar = bar.get_or_insert_with(|| {
                 interrupt::say(format!(
-                    "coseg: interrupted; the daemon goes on with what is queued in {collection:?}\n  \
-                     to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel -c {collection:?}"
+                    "coseg: interrupted; the daemon continues with the queue of {collection:?}\n  \
+                     to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel -c \
+                     {collection:?}"
                 ));
                 spinner("waiting")
             });
             bar.set_message(format!(
-                "{} shapes to place, {} to relabel",
-                reply.n_queued, reply.n_stale
+                "{} to place, {} to relabel",
+                counted(reply.n_queued, "shape"),
+                reply.n_stale
             ));
             bar.tick();
         }
@@ -209,10 +212,7 @@ impl Session {
 
 /// Prints a line of data to stdout.
 pub(crate) fn print_line(text: &str) -> Result<(), CommandError> {
-    let mut out = std::io::stdout().lock();
-    writeln!(out, "{text}")
-        .and_then(|()| out.flush())
-        .map_err(CommandError::Output)
+    coseg::text::print_line(text).map_err(CommandError::Output)
 }
 
 /// The label with this name; a label that was merged into another is out of use.
@@ -230,7 +230,7 @@ fn label_named(name: &str, labels: &[wire::LabelInfo]) -> Result<u32, String> {
         _ => {
             let ids: Vec<String> = ids.iter().map(u32::to_string).collect();
             Err(format!(
-                "{} labels are named {name:?}, say which by its id: {}",
+                "{} labels are named {name:?}, choose one by its id: {}",
                 ids.len(),
                 ids.join(", ")
             ))
@@ -245,28 +245,6 @@ pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     CommandError::Usage(format!(
         "there are several collections, choose one with --collection: {names}"
     ))
-}
-
-/// Pads columns to the widest entry; the first row is the heading.
-pub(crate) fn table(rows: &[Vec<String>]) -> String {
-    let shown_row = |row: &Vec<String>| row.iter().map(|c| shown(c).into_owned()).collect();
-    let rows: Vec<Vec<String>> = rows.iter().map(shown_row).collect();
-    let n = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width = |i: usize| {
-        rows.iter()
-            .filter_map(|r| r.get(i))
-            .map(|c| c.chars().count())
-            .max()
-    };
-    let widths: Vec<usize> = (0..n).map(|i| width(i).unwrap_or(0)).collect();
-    let lines = rows.iter().map(|row| {
-        let cells = row
-            .iter()
-            .zip(&widths)
-            .map(|(cell, &width)| format!("{cell:width$}"));
-        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
-    });
-    lines.collect::<Vec<_>>().join("\n")
 }
 
 /// A progress bar on stderr if stderr is a terminal, else one that draws nothing.
@@ -288,7 +266,7 @@ fn spinner(message: &'static str) -> ProgressBar {
 
 #[cfg(test)]
 mod tests {
-    use super::{label_named, table};
+    use super::label_named;
     use coseg::ipc::wire::LabelInfo;
 
     #[test]
@@ -311,7 +289,7 @@ mod tests {
         for (name, said) in [
             (
                 "back",
-                "2 labels are named \"back\", say which by its id: 3, 4",
+                "2 labels are named \"back\", choose one by its id: 3, 4",
             ),
             ("seta", "no label is named \"seta\"; did you mean \"seat\"?"),
             ("wing", "no label is named \"wing\""),
@@ -319,14 +297,5 @@ mod tests {
             assert_eq!(label_named(name, &labels), Err(said.to_owned()));
         }
         assert!(label_named("", &labels).is_err());
-    }
-
-    #[test]
-    fn columns_line_up() {
-        let row = |a: &str, b: &str| vec![a.to_owned(), b.to_owned()];
-        assert_eq!(
-            table(&[row("name", "n"), row("a", "12")]),
-            "name  n\na     12"
-        );
     }
 }

@@ -2,11 +2,14 @@
 //! with its labels.
 
 use super::collections::warn_of_up;
-use super::session::{Session, table};
+use super::session::Session;
 use super::{Outcome, json};
 use crate::cli::Show;
 use coseg::call;
+use coseg::ipc::convert::up_name;
 use coseg::ipc::wire;
+use coseg::text::counted;
+use coseg::text::table;
 
 pub(crate) fn run(args: &Show, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
@@ -44,17 +47,14 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     let parts = n_parts.map_or_else(|| "estimated".to_owned(), |n| n.to_string());
     let sure = c.up_estimate.map_or_else(String::new, |e| {
         let percent = 100.0 * e.agreement;
-        format!(
-            " ({}, {percent:.0} % of the shapes agree)",
-            json::up(e.up())
-        )
+        format!(" ({}, {percent:.0} % of the shapes agree)", up_name(e.up()))
     });
     session.line(&format!(
-        "{}: {} shapes ({} stale), parts {parts}, up {}{sure}, sequence {}",
+        "{}: {} ({} stale), parts {parts}, up {}{sure}, sequence {}",
         spec.name,
-        c.n_shapes,
+        counted(c.n_shapes, "shape"),
         c.n_stale,
-        json::up(spec.up()),
+        up_name(spec.up()),
         c.sequence
     ))?;
     let mut rows = vec![
@@ -70,7 +70,7 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
             json::colour(l.colour_rgb),
             state.unwrap_or_else(|| match l.n_shapes {
                 0 => "out of use".to_owned(),
-                n => format!("on {n} shapes"),
+                n => format!("on {}", counted(n, "shape")),
             }),
         ]);
     }
@@ -81,7 +81,7 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
 /// The findings and actions of cleaning as text.
 pub(super) fn found(r: &wire::CleanReport) -> String {
     let inner = format!(
-        "inner walls left to those around them ({} triangles)",
+        "inner walls represented by outer ones ({} triangles)",
         r.n_inner_triangles
     );
     let counts = [
@@ -89,7 +89,7 @@ pub(super) fn found(r: &wire::CleanReport) -> String {
         ("isolated vertices", r.n_isolated_vertices),
         ("degenerate triangles dropped", r.n_degenerate_triangles),
         ("duplicate triangles dropped", r.n_duplicate_triangles),
-        ("triangles turned over", r.n_flipped_triangles),
+        ("triangles flipped", r.n_flipped_triangles),
         ("non-manifold edges", r.n_nonmanifold_edges),
         ("boundary edges", r.n_boundary_edges),
         (inner.as_str(), r.n_inner_walls),
@@ -101,7 +101,7 @@ pub(super) fn found(r: &wire::CleanReport) -> String {
             r.n_nonsimple_polygons,
         ),
         (
-            "statements that programs differ about read",
+            "statements read that programs interpret differently",
             r.n_tolerated_statements,
         ),
         ("other statements not read", r.n_unread_statements),
@@ -115,7 +115,7 @@ pub(super) fn found(r: &wire::CleanReport) -> String {
         [] => "clean".to_owned(),
         found => found.join(", "),
     };
-    format!("{} components, {found}", r.n_components)
+    format!("{}, {found}", counted(r.n_components, "component"))
 }
 
 fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session) -> Outcome {
@@ -161,7 +161,7 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
                 )
             })
             .collect();
-        session.line(&format!("labels carried from {}", sources.join(", ")))?;
+        session.line(&format!("labels propagated from {}", sources.join(", ")))?;
     }
     Ok(true)
 }

@@ -1,15 +1,21 @@
 //! `coseg stats` prints the counters of the daemon.
 
 use super::Outcome;
-use super::session::{Session, table};
+use super::session::Session;
 use coseg::call;
 use coseg::ipc::wire;
+use coseg::text::table;
 use serde_json::{Value, json};
 
 /// The counters as JSON.
 pub(crate) fn json(s: &wire::StatsReply) -> Value {
     let stages = s.stages.iter().map(|s| {
-        json!({ "stage": s.stage, "n_shapes": s.n_shapes, "total_ms": s.total_ms, "n_now": s.n_now })
+        json!({
+            "stage": s.stage,
+            "n_shapes": s.n_shapes,
+            "total_ms": s.total_ms,
+            "n_now": s.n_now,
+        })
     });
     json!({
         "version": s.version,

@@ -56,13 +56,14 @@ fn in_work(session: &mut Session) -> Result<Vec<String>, CommandError> {
 
 fn what_is_waited_for(in_work: &[String], n_queued: u64) -> String {
     let first = match in_work {
-        [] => "the daemon answers what was asked, then ends".to_owned(),
+        [] => "the daemon answers pending requests, then ends".to_owned(),
         some => format!("the daemon finishes {}, then ends", some.join(", ")),
     };
     let n_left = n_queued.saturating_sub(in_work.len() as u64);
     match n_left {
         0 => first,
-        n => format!("{first}; {n} shapes that it has not begun are left for the next start"),
+        1 => format!("{first}; 1 shape that it has not begun remains for the next start"),
+        n => format!("{first}; {n} shapes that it has not begun remain for the next start"),
     }
 }
 
@@ -74,7 +75,8 @@ fn wait_until_gone(endpoint: &Endpoint) -> Result<(), CommandError> {
         if begin.elapsed() > LONGEST_WAIT {
             let seconds = LONGEST_WAIT.as_secs();
             return Err(CommandError::Failed(format!(
-                "somebody still listens at {endpoint} after {seconds} s: the daemon, or one that was started in its place"
+                "{endpoint} still has a listener after {seconds} s: the daemon, or one that was \
+                 started in its place"
             )));
         }
         std::thread::sleep(LOOK);
@@ -101,11 +103,11 @@ mod tests {
             let names: Vec<String> = names.iter().map(|n| (*n).to_owned()).collect();
             what_is_waited_for(&names, n)
         };
-        assert_eq!(of(&[], 0), "the daemon answers what was asked, then ends");
+        assert_eq!(of(&[], 0), "the daemon answers pending requests, then ends");
         assert_eq!(
             of(&["a (describe)", "b (place)"], 5),
-            "the daemon finishes a (describe), b (place), then ends; 3 shapes that it has not begun are left for the \
-             next start"
+            "the daemon finishes a (describe), b (place), then ends; 3 shapes that it has \
+             not begun remain for the next start"
         );
     }
 }

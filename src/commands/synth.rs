@@ -3,6 +3,7 @@
 use clap::Args;
 use coseg::mesh::write::off;
 use coseg::synth::{Family, LEAST_FACES, Options, UnknownFamily, generate};
+use coseg::text::counted;
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -146,7 +147,8 @@ fn write_family(args: &SynthArgs, as_json: bool) -> Result<String, SynthError> {
     let n_parts = family.label_names().len();
     let (n, path) = (written.len(), out.display());
     Ok(format!(
-        "{n} shapes of family {family} ({n_parts} parts) in {path}\n"
+        "{} of family {family} ({n_parts} parts) in {path}\n",
+        counted(n as u64, "shape")
     ))
 }
 

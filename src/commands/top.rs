@@ -1,10 +1,12 @@
 //! `coseg top` displays queue, rates and stages of the daemon, and refreshes them periodically.
 
-use super::session::{Session, print_line, table};
+use super::session::{Session, print_line};
 use super::{Outcome, stats};
 use crate::cli::Top;
 use coseg::call;
 use coseg::ipc::wire::{StatsReply, StatsRequest};
+use coseg::text::counted;
+use coseg::text::table;
 use std::fmt::Write as _;
 use std::io::IsTerminal as _;
 use std::time::Instant;
@@ -68,9 +70,9 @@ fn picture(now: &StatsReply, before: Option<(f64, &StatsReply)>) -> String {
         &mut text,
         "library",
         format!(
-            "{} shapes in {} collections, {} on disk",
-            now.n_shapes,
-            now.n_collections,
+            "{} in {}, {} on disk",
+            counted(now.n_shapes, "shape"),
+            counted(now.n_collections, "collection"),
             bytes(now.stored_bytes + now.catalog_bytes)
         ),
     );
@@ -78,8 +80,9 @@ fn picture(now: &StatsReply, before: Option<(f64, &StatsReply)>) -> String {
         &mut text,
         "queue",
         format!(
-            "{} shapes to place, {} to relabel",
-            now.n_queued, now.n_stale
+            "{} to place, {} to relabel",
+            counted(now.n_queued, "shape"),
+            now.n_stale
         ),
     );
     line(
@@ -96,12 +99,12 @@ fn picture(now: &StatsReply, before: Option<(f64, &StatsReply)>) -> String {
         &mut text,
         "requests",
         format!(
-            "{:.1}/s, {}/s in, {}/s out; {} refused, {} shapes failed",
+            "{:.1}/s, {}/s in, {}/s out; {} refused, {} failed",
             rate(|s| s.n_requests),
             bytes(rate(|s| s.received_bytes) as u64),
             bytes(rate(|s| s.sent_bytes) as u64),
             now.n_refused,
-            now.n_failed
+            counted(now.n_failed, "shape")
         ),
     );
     line(

@@ -7,6 +7,7 @@ use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::frames::{FrameError, FrameReader};
 use coseg::ipc::wire;
+use coseg::text::counted;
 use coseg::viewer::{Embedded, portrait};
 use serde_json::{Map, Value, json};
 
@@ -95,12 +96,13 @@ pub(crate) fn run(args: &View, mut session: Session) -> Outcome {
     } else {
         let mb = page.len() as f64 / 1e6;
         eprintln!(
-            "{} shapes, {n_functions} with functions, {n_maps} maps: {mb:.1} MB in {}",
-            shapes.len(),
+            "{}, {n_functions} with functions, {}: {mb:.1} MB in {}",
+            counted(shapes.len() as u64, "shape"),
+            counted(n_maps as u64, "map"),
             args.out.display()
         );
         if shapes.len() > n_functions || n_stored > shapes.len() {
-            eprintln!("--max, --functions and --maps say how much goes in");
+            eprintln!("--max, --functions and --maps set how much the page contains");
         }
     }
     Ok(true)

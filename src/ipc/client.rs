@@ -27,7 +27,10 @@ const REPLY_LIMITS: FrameLimits = FrameLimits {
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum ClientError {
-    #[error("no answer from {endpoint} within {} s; is a daemon running there?", timeout.as_secs_f64())]
+    #[error(
+        "no answer from {endpoint} within {} s; is a daemon running there?",
+        timeout.as_secs_f64()
+    )]
     NoAnswer { endpoint: String, timeout: Duration },
     #[error(transparent)]
     Endpoint(#[from] EndpointError),

@@ -30,8 +30,8 @@ pub enum EndpointError {
         limit: usize,
     },
     #[error(
-        "endpoint {uri:?} is not loopback, which needs keys (security.keys, `coseg keys generate`); without \
-         them only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
+        "endpoint {uri:?} is not loopback, which needs keys (security.keys, `coseg keys \
+         generate`); without them only ipc:// and tcp on 127.0.0.0/8, [::1] or localhost are served"
     )]
     NotLoopback { uri: String },
     #[error("{path} {message}")]

@@ -67,12 +67,12 @@ impl DefaultFolder {
         let path = self.path().display().to_string();
         let refuse = |found: String, cure: String| {
             let path = path.clone();
-            let message =
-                format!("{found}, so whoever listens there need not be your daemon; {cure}");
+            let message = format!("{found}, so a listener there need not be your daemon; {cure}");
             Err(EndpointError::Directory { path, message })
         };
         if owner != me && owner != 0 {
-            let cure = "remove it, set XDG_RUNTIME_DIR to a folder of your own, or name the daemon with --endpoint";
+            let cure = "remove it, set XDG_RUNTIME_DIR to a folder of your own, or name the \
+                        daemon with --endpoint";
             return refuse(
                 format!("belongs to user {owner}, not to {me}"),
                 cure.to_owned(),

@@ -457,7 +457,8 @@ mod tests {
         assert_eq!((kept.len(), kept[0].len()), (1, 4));
         assert_eq!(
             error.to_string(),
-            "the message has 11 bytes, the limit is 10 bytes (limits.max_message of the daemon's configuration)"
+            "the message has 11 bytes, the limit is 10 bytes (limits.max_message of the daemon's \
+             configuration)"
         );
         let (_, error) = message(&[1, 1, 1, 1]).unwrap_err();
         assert_eq!(

@@ -1,6 +1,8 @@
 //! Formats the daemon's replies as JSON.
 
+use crate::ipc::convert::up_name;
 use crate::ipc::wire::{self, event::Kind};
+use crate::text::counted;
 use serde_json::{Map, Value, json};
 
 /// The name of an enum value without its prefix, in lower case.
@@ -8,20 +10,6 @@ fn short(name: &str, prefix: &str) -> String {
     name.strip_prefix(prefix)
         .unwrap_or(name)
         .to_ascii_lowercase()
-}
-
-/// The name of an up axis on the command line.
-pub fn up(up: wire::Up) -> &'static str {
-    match up {
-        wire::Up::PlusX => "+x",
-        wire::Up::MinusX => "-x",
-        wire::Up::PlusY => "+y",
-        wire::Up::MinusY => "-y",
-        wire::Up::PlusZ => "+z",
-        wire::Up::MinusZ => "-z",
-        wire::Up::Unspecified | wire::Up::Unknown => "unknown",
-        wire::Up::Auto => "auto",
-    }
 }
 
 /// The outcome of an added shape.
@@ -36,7 +24,7 @@ pub fn colour(rgb: u32) -> String {
 
 /// An estimate of the up axis.
 pub fn up_estimate(e: &wire::UpEstimate) -> Value {
-    json!({ "up": up(e.up()), "agreement": e.agreement })
+    json!({ "up": up_name(e.up()), "agreement": e.agreement })
 }
 
 /// A collection with its labels.
@@ -45,7 +33,7 @@ pub fn collection(c: &wire::Collection) -> Value {
     json!({
         "name": spec.name,
         "n_parts": spec.n_parts.filter(|&n| n > 0),
-        "up": up(spec.up()),
+        "up": up_name(spec.up()),
         "up_estimate": c.up_estimate.as_ref().map(up_estimate),
         "up_disagrees": c.up_disagrees.as_ref().map(up_estimate),
         "operator": short(spec.operator().as_str_name(), "OPERATOR_").replace('_', "-"),
@@ -286,15 +274,15 @@ pub fn event_line(e: &wire::Event) -> String {
         Some(Kind::LabelNamed(n)) => format!("label {} named {:?}", n.label, n.name),
         Some(Kind::LabelRetired(l)) => format!("label {} out of use", l.label),
         Some(Kind::Corrected(c)) => format!(
-            "{} corrected, version {}, {} faces ({}) labelled by hand",
+            "{} corrected, version {}, {} ({}) labelled by hand",
             c.shape,
             c.version,
-            c.n_faces,
+            counted(c.n_faces, "face"),
             percent(c.area_share)
         ),
         Some(Kind::Undone(u)) => format!("{} undone", u.change),
         Some(Kind::UpChanged(c)) => {
-            format!("up axis {} in place of {}", c.to, c.from)
+            format!("up axis {} instead of {}", c.to, c.from)
         }
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };

@@ -45,13 +45,13 @@ pub enum KeyError {
     TooLarge { path: String, limit: u64 },
     #[error("name {name:?} must be 1 to {limit} letters, digits, `.`, `_`, `-` or `@`")]
     Name { name: String, limit: usize },
-    #[error("{key:?} is no key: a key has 40 characters of Z85")]
+    #[error("{key:?} is not a key: a key has 40 characters of Z85")]
     NoKey { key: String },
     #[error("{what} is on the allow list already, as {name:?}")]
     Taken { what: String, name: String },
-    #[error("nobody on the allow list has the name or key {who:?}")]
+    #[error("no client on the allow list has the name or key {who:?}")]
     Unknown { who: String },
-    #[error("a pair of keys cannot be made: {0}")]
+    #[error("a pair of keys cannot be generated: {0}")]
     Generate(zmq::Error),
 }
 

@@ -44,7 +44,8 @@ mod tests {
         }
         assert_eq!(
             beyond("the file", 80_000_000, 64 << 20, "limits.max_shape"),
-            "the file has 76.3 MiB (80000000 bytes), the limit is 64 MiB (limits.max_shape of the daemon's configuration)"
+            "the file has 76.3 MiB (80000000 bytes), the limit is 64 MiB (limits.max_shape of the \
+             daemon's configuration)"
         );
     }
 }

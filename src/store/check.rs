@@ -105,13 +105,13 @@ pub fn check(dir: &Path) -> Result<Vec<Finding>, StoreError> {
     match witness {
         _ if n_orphans == 0 => {}
         _ if is_short => findings.damage("originals", text),
-        // The other changes were interrupted additions, and nothing else.
+        // With an intact witness these are interrupted additions, and nothing else.
         Found::Whole(_) => {}
         Found::Missing | Found::Damaged(_) => findings.note(
             "originals".into(),
             format!(
-                "{text}, and without {WITNESS_FILE} nothing tells whether it held them once: if \
-                 these are more than were being added at a time, restore a snapshot"
+                "{text}, and without {WITNESS_FILE} it is unknown whether the catalog held them: \
+                 if these are more than were being added at one time, restore a snapshot"
             ),
         ),
     }
@@ -410,10 +410,12 @@ fn check_maps(
                 };
                 let (one, two) = (name(from), name(to));
                 let text = format!(
-                    "the map from {one} to {two} carries functions otherwise than the maps by way of other shapes do: \
-                     departure {:.2} (0: the same, 1.4: nothing in common), the median over {} third shapes. Nothing \
-                     is damaged and nothing need be done: labels that come along it count as little as its confidence \
-                     says. `coseg check --repair` looks for a better one",
+                    "the map from {one} to {two} carries functions otherwise than the maps by way \
+                     of other shapes do: departure {:.2} (0: the same, 1.4: nothing in common), \
+                     the median over {} \
+                     third shapes. Nothing is damaged and nothing need be done: labels that come \
+                     along it count as \
+                     little as its confidence says. `coseg check --repair` looks for a better one",
                     standing.departure, standing.n_triangles
                 );
                 findings.note(format!("maps {from}, {to}"), text);

@@ -28,7 +28,7 @@ pub enum StoreError {
     Missing { table: &'static str, key: String },
     #[error("catalog: {table} already has a row {key}")]
     Exists { table: &'static str, key: String },
-    #[error("catalog: {table} {key} refers to a row that is not there")]
+    #[error("catalog: {table} {key} refers to a row that does not exist")]
     Dangling { table: &'static str, key: String },
     #[error("catalog: the {what} is {value}, but must be {expected}")]
     Must {

@@ -126,7 +126,7 @@ impl Holder {
         };
         if self.is_gone() {
             return format!(
-                "what process {pid}, which has ended, had started; it ends by itself, try again"
+                "a child of process {pid}, which has ended; the child ends by itself, try again"
             );
         }
         match &self.endpoint {
@@ -171,7 +171,8 @@ mod tests {
         assert_eq!(
             refused(),
             held(
-                ", the daemon at ipc:///run/x/coseg.sock; `coseg stop --endpoint ipc:///run/x/coseg.sock` ends it"
+                ", the daemon at ipc:///run/x/coseg.sock; `coseg stop --endpoint \
+                 ipc:///run/x/coseg.sock` ends it"
             )
         );
         // The data of an earlier holder do not describe the next one.
@@ -192,7 +193,7 @@ mod tests {
         }
         let gone = Holder::parse("2147483647\nipc:///x\n").in_words();
         assert!(
-            gone.starts_with("what process 2147483647, which has ended"),
+            gone.starts_with("a child of process 2147483647, which has ended"),
             "{gone}"
         );
     }

@@ -142,8 +142,10 @@ impl MappedDescription {
     }
 
     fn slice<T: bytemuck::AnyBitPattern>(&self, range: &Range<usize>) -> &[T] {
-        bytemuck::try_cast_slice(&self.0.file[range.clone()])
-            .expect("invariant: the layout was checked for bounds, sizes and alignment, and maps begin at pages")
+        bytemuck::try_cast_slice(&self.0.file[range.clone()]).expect(
+            "invariant: the layout was checked for bounds, sizes and alignment, and maps \
+                     begin at pages",
+        )
     }
 }
 

@@ -105,7 +105,7 @@ pub fn accept_loss(dir: &Path) -> Result<Option<String>, StoreError> {
     witness.write(&path)?;
     let copy = copy.strip_prefix(dir).unwrap_or(&copy).display();
     Ok(Some(format!(
-        "{what}; it goes on as of change {committed}, and {copy} is what was there"
+        "{what}; the library continues from change {committed}, and {copy} has the previous files"
     )))
 }
 

@@ -172,8 +172,8 @@ pub struct LabelVersionRow {
     pub cause: String,
     /// Label of each proxy face `(m,)`; -1 is unlabelled.
     pub proxy_labels: Vec<i32>,
-    /// Probability of each label for each proxy face `(m, k)`, see [`confidence_to_u8`]; the order of the
-    /// labels is that of the collection's model.
+    /// Probability of each label for each proxy face `(m, k)`, see [`confidence_to_u8`]; the order
+    /// of the labels is that of the collection's model.
     pub proxy_probabilities: Vec<u8>,
     /// Label of each input polygon `(n_polygons,)`; -1 is unlabelled.
     pub polygon_labels: Vec<i32>,

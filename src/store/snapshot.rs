@@ -99,7 +99,7 @@ fn take_over(partial: &Path) -> Result<Locked, StoreError> {
         FOLDERS.contains(&&*name) || name.starts_with("catalog.")
     };
     if entries.iter().any(|entry| !is_ours(&entry.file_name())) {
-        return refuse("it is there, and holds what no copy leaves");
+        return refuse("it exists, and contains files that no copy leaves");
     }
     for entry in entries {
         let path = entry.path();

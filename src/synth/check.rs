@@ -1,10 +1,11 @@
-//! What tests ask of a generated mesh.
+//! Checks properties of generated meshes for tests.
 
 use super::vector::{cross, dot, norm, sub};
 use crate::mesh::TriMesh;
 use std::collections::HashMap;
 
-/// Every directed edge once, its reverse once; every vertex used, its faces one fan.
+/// Checks that every directed edge occurs once, and its reverse once, and that every vertex is used
+/// and its faces form one fan.
 pub(super) fn closed_manifold(mesh: &TriMesh) {
     let mut next: HashMap<(u32, u32), u32> = HashMap::new();
     let mut degree = vec![0; mesh.vertices.len()];

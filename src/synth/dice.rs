@@ -1,17 +1,18 @@
-//! A seed becomes the random choices of one shape, the same on every machine.
+//! Draws the random choices of one shape from a seed, the same on every machine.
 
 use super::vector::Vec3;
 use rand_pcg::Pcg64;
 use rand_pcg::rand_core::RngCore;
 
-/// Random numbers of one shape. Built on the generator's raw output alone: distributions of other crates
-/// may change between their versions.
+/// Random numbers of one shape. They use the generator's raw output alone, since distributions of
+/// other crates may change between versions.
 pub(super) struct Dice(Pcg64);
 
 impl Dice {
-    /// `salt` tells apart what is drawn for one shape.
+    /// `salt` separates the sequences that are drawn for one shape.
     pub(super) fn new(seed: u64, family: u64, index: u32, salt: u64) -> Self {
-        // Neighbouring seeds must not give similar sequences, so each number is mixed into the state.
+        // Each number is mixed into the state, since neighbouring seeds must not give similar
+        // sequences.
         let low = mixed(mixed(seed) ^ mixed(family.wrapping_mul(3) + 1));
         let high = mixed(low ^ mixed(u64::from(index).wrapping_mul(5) + 2));
         let state = u128::from(high) << 64 | u128::from(low);
@@ -85,7 +86,7 @@ mod tests {
 
     #[test]
     fn the_sequence_is_fixed() {
-        // A change here changes every generated shape, and with it what seeds in the docs stand for.
+        // A change here changes every generated shape, and thus the meaning of seeds in the docs.
         let mut dice = Dice::new(1, 0, 0, 0);
         let first: Vec<u64> = (0..3).map(|_| (dice.fraction() * 1e9) as u64).collect();
         assert_eq!(first, FIRST);

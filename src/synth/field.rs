@@ -1,8 +1,9 @@
-//! A shape as primitives becomes a smooth function of space: negative inside, zero on the surface.
+//! Evaluates a shape of primitives as a smooth function of space: negative inside, zero on the
+//! surface.
 //!
-//! Primitives are joined by the quadratic smooth minimum (I. Quilez, "Smooth minimum"), which changes values
-//! only where two of them differ by less than the blend width, so that parts that merely pass near each
-//! other do not swell.
+//! Primitives are joined by the quadratic smooth minimum (I. Quilez, "Smooth minimum"). It changes
+//! values only where two of them differ by less than the blend width, so that parts which merely
+//! pass near each other do not swell.
 
 use super::solid::{Ball, Solid};
 use super::vector::{Frame, Vec3, along, scale};
@@ -17,10 +18,10 @@ fn smooth_min(a: f64, b: f64, k: f64) -> f64 {
     }
 }
 
-/// Solids that grow out of what was built before them, or are cut out of it.
+/// Solids that blend into earlier ones, or are cut out of them.
 #[derive(Debug, Clone)]
 pub(super) struct Limb {
-    /// Blend width to what was built before.
+    /// Blend width to earlier limbs.
     blend: f64,
     /// Blend width between its own solids.
     joint: f64,
@@ -43,7 +44,7 @@ impl Limb {
         self.solid(label, Solid::Cone { a, b, ra, rb })
     }
 
-    /// Adds a tube along points, its radius going evenly from `ra` to `rb`.
+    /// Adds a tube along points, whose radius changes linearly from `ra` to `rb`.
     pub(super) fn tube(&mut self, label: u32, points: &[Vec3], ra: f64, rb: f64) -> &mut Self {
         self.solid(
             label,
@@ -81,14 +82,16 @@ impl Limb {
     }
 }
 
-/// A shape: limbs in the order they were built. The first solid holds the seed of the surface.
+/// A shape: limbs in the order in which they were built. The first solid contains the seed of the
+/// surface.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Scene {
     limbs: Vec<Limb>,
 }
 
 impl Scene {
-    /// Begins a limb that blends over `blend` into what is there, and whose own solids blend over `joint`.
+    /// Begins a limb that blends over `blend` into the earlier ones, and whose own solids blend
+    /// over `joint`.
     pub(super) fn limb(&mut self, blend: f64, joint: f64) -> &mut Limb {
         self.push(Limb {
             blend,
@@ -99,7 +102,7 @@ impl Scene {
         })
     }
 
-    /// Begins a limb that is cut out of what is there.
+    /// Begins a limb that is cut out of the earlier ones.
     pub(super) fn cut(&mut self, blend: f64) -> &mut Limb {
         self.push(Limb {
             blend,
@@ -121,7 +124,7 @@ impl Scene {
     pub(super) fn value(&self, p: Vec3) -> f64 {
         let mut value = f64::INFINITY;
         for limb in &self.limbs {
-            // What is farther than the blend reaches would change nothing.
+            // A limb that is farther away than the blend reaches has no effect.
             let reach = if limb.cut { -value } else { value } + limb.blend;
             if limb.ball.is_none_or(|ball| ball.distance(p) >= reach) {
                 continue;
@@ -141,7 +144,8 @@ impl Scene {
         value
     }
 
-    /// The gradient of [`Scene::value`], by differences along the corners of a tetrahedron of size `step`.
+    /// The gradient of [`Scene::value`], by differences along the corners of a tetrahedron of size
+    /// `step`.
     pub(super) fn gradient(&self, p: Vec3, step: f64) -> Vec3 {
         let corners = [
             [1.0, -1.0, -1.0],
@@ -155,7 +159,7 @@ impl Scene {
         scale(sum, 1.0 / (4.0 * step))
     }
 
-    /// The label of the solid nearest to a point; of equally near ones, the first.
+    /// The label of the solid nearest to a point; ties go to the first.
     pub(super) fn label(&self, p: Vec3) -> u32 {
         let mut best = (f64::INFINITY, 0);
         for (solid, label, _) in self.limbs.iter().filter(|l| !l.cut).flat_map(|l| &l.solids) {

@@ -1,8 +1,10 @@
-//! A family, a seed and a number become a labelled shape: closed, smooth, varied in pose and topology.
+//! Generates labelled shapes from a family, a seed and a number: closed, smooth, varied in pose and
+//! topology.
 //!
-//! Shapes are implicit surfaces of blended primitives, each primitive with a label; a face has the label of
-//! the primitive nearest to it. They are test fixtures and the input of the demonstration, so the same seed
-//! gives the same bytes on every machine: the arithmetic is `+ - * / sqrt` throughout (see `vector`).
+//! Shapes are implicit surfaces of blended primitives. Each primitive has a label; a face has the
+//! label of the nearest primitive. They are test fixtures and the input of the demonstration, so
+//! the same seed gives the same bytes on every machine: the arithmetic is `+ - * / sqrt` throughout
+//! (see `vector`).
 
 mod dice;
 mod families;
@@ -25,19 +27,19 @@ use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use std::str::FromStr;
 use vector::{cross, dot, norm, sub};
 
-/// Fewest faces a shape is generated with; fewer cannot hold its handles and legs.
+/// The least number of faces of a generated shape; with fewer, handles and legs are lost.
 pub const LEAST_FACES: u32 = 1_000;
 
-/// Vertices are rounded to a millionth, so that files are short and read back as the same mesh.
+/// Vertices are rounded to a millionth, so that files are short and parse to the same mesh.
 const DECIMALS: f64 = 1e6;
 
-/// Farther from its seed than this no shape reaches.
+/// No shape reaches farther than this from its seed.
 const REACH: f64 = 8.0;
 
 /// A kind of shape whose members share parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Family {
-    /// Four-legged animals: dogs, giraffes, cows, and what lies between.
+    /// Four-legged animals: dogs, giraffes, cows, and forms in between.
     Animal,
     /// Birds, standing or in flight, wings folded or spread.
     Bird,
@@ -65,7 +67,7 @@ impl Family {
         Self::Candelabra,
     ];
 
-    /// Its name, as [`Family::from_str`] reads it.
+    /// Its name, which [`Family::from_str`] parses.
     pub fn name(self) -> &'static str {
         match self {
             Self::Animal => "animal",
@@ -110,9 +112,10 @@ impl std::fmt::Display for Family {
     }
 }
 
-/// There is no family of this name.
+/// The error for an unknown family.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no family is called '{0}'; there are {names}", names = Family::ALL.map(Family::name).join(", "))]
+#[error("no family is called '{0}'; there are \
+         {names}", names = Family::ALL.map(Family::name).join(", "))]
 pub struct UnknownFamily(pub String);
 
 impl FromStr for Family {
@@ -124,10 +127,10 @@ impl FromStr for Family {
     }
 }
 
-/// What shapes are generated with.
+/// Options of generation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Options {
-    /// Faces of each mesh; at least [`LEAST_FACES`] are used, and an odd number is lowered by one.
+    /// Number of faces of each mesh: at least [`LEAST_FACES`], and an odd number is lowered by one.
     pub n_faces: u32,
     /// Whether each shape is turned at random; otherwise +y is up and they face the same way.
     pub rotate: bool,
@@ -142,14 +145,15 @@ impl Default for Options {
     }
 }
 
-/// A shape whose parts are known.
+/// A shape with known parts.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Labelled {
-    /// Closed, edge-manifold, one component, faces counter-clockwise seen from outside. About one unit high.
+    /// Closed, edge-manifold, one component, faces counter-clockwise seen from outside. About one
+    /// unit high.
     pub mesh: TriMesh,
     /// A label per face.
     pub labels: Vec<u32>,
-    /// What the labels mean, by label; the same for the whole family.
+    /// The names of the labels; the same for the whole family.
     pub label_names: &'static [&'static str],
     /// Unique within family and seed: `chair-007` for index 6.
     pub name: String,
@@ -169,7 +173,7 @@ pub fn generate(family: Family, seed: u64, index: u32, options: &Options) -> Lab
     let mut mesh = mesh_of(&scene, options.n_faces.max(LEAST_FACES) as usize);
     let labels = parts::labels(&scene, &mesh);
     if options.rotate {
-        // Drawn from numbers of its own, so that turning does not change the shape.
+        // The rotation has random numbers of its own, so that turning does not change the shape.
         let rows = Dice::new(seed, family as u64, index, 1).rotation();
         for v in &mut mesh.vertices {
             *v = rows.map(|row| dot(row, *v));
@@ -188,13 +192,13 @@ pub fn generate(family: Family, seed: u64, index: u32, options: &Options) -> Lab
     }
 }
 
-/// The surface of a scene in about `n_faces` even triangles.
+/// The surface of a scene in about `n_faces` triangles of similar size.
 fn mesh_of(scene: &Scene, n_faces: usize) -> TriMesh {
     let extract = |cell| {
         surface::surface(|p| scene.value(p), scene.seed(), cell, REACH)
             .expect("invariant: the seed of a scene lies inside, and scenes are bounded")
     };
-    // Cells must be smaller than the thinnest part, and than the triangles wanted.
+    // Cells must be smaller than the thinnest part, and than the target triangles.
     let cell = (0.9 * scene.thickness()).min(0.05);
     let mut mesh = extract(cell);
     let area: f64 = mesh.faces.iter().map(|f| face_area(&mesh, f)).sum();

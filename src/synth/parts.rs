@@ -1,4 +1,4 @@
-//! The primitives of a scene and its mesh become one label per face.
+//! Labels the faces of a mesh by the primitives of its scene.
 
 use super::face_area;
 use super::field::Scene;
@@ -7,13 +7,13 @@ use crate::labels::score::pieces;
 use crate::mesh::TriMesh;
 use std::collections::BTreeMap;
 
-/// Pieces of one label below this share of the area are crumbs at a seam, not parts.
+/// Pieces of one label below this share of the area are artefacts of a seam, not parts.
 const LEAST_PIECE: f64 = 0.002;
 
-/// Rounds of straightening seams; teeth of one face are gone after two.
+/// Rounds of straightening seams; teeth of one face vanish after two.
 const N_ROUNDS: usize = 3;
 
-/// The label of the primitive nearest to each face, without teeth along the seams and without crumbs.
+/// The label of the primitive nearest to each face, without teeth and small pieces along the seams.
 pub(super) fn labels(scene: &Scene, mesh: &TriMesh) -> Vec<u32> {
     let centre = |face: &[u32; 3]| {
         let [a, b, c] = face.map(|v| mesh.vertices[v as usize]);
@@ -33,7 +33,7 @@ pub(super) fn labels(scene: &Scene, mesh: &TriMesh) -> Vec<u32> {
     }
     let areas: Vec<f64> = mesh.faces.iter().map(|f| face_area(mesh, f)).collect();
     let least = LEAST_PIECE * areas.iter().sum::<f64>();
-    // The smallest crumb goes first, since it may join two pieces into a larger one.
+    // The smallest piece is relabelled first, since it may join two pieces to a larger one.
     while let Some((faces, label)) = smallest_crumb(mesh, &labels, &areas, &across, least) {
         for f in faces {
             labels[f] = label;
@@ -53,7 +53,7 @@ fn across(mesh: &TriMesh) -> Vec<[usize; 3]> {
     }
     edges.sort_unstable();
     let mut across = vec![[0; 3]; mesh.faces.len()];
-    // The mesh is closed and manifold: every edge is there twice, side by side.
+    // The mesh is closed and manifold, so every edge occurs twice, in adjacent entries.
     for pair in edges.chunks_exact(2) {
         let ((_, f, i), (_, g, j)) = (pair[0], pair[1]);
         across[f][i] = g;
@@ -62,7 +62,7 @@ fn across(mesh: &TriMesh) -> Vec<[usize; 3]> {
     across
 }
 
-/// Each face takes the label that two of its neighbours agree on against it.
+/// Each face takes a label that two of its neighbours share if its own differs.
 fn straightened(labels: &[i32], across: &[[usize; 3]]) -> Vec<i32> {
     let vote = |(label, near): (&i32, &[usize; 3])| {
         let [a, b, c] = near.map(|f| labels[f]);
@@ -75,8 +75,8 @@ fn straightened(labels: &[i32], across: &[[usize; 3]]) -> Vec<i32> {
     labels.iter().zip(across).map(vote).collect()
 }
 
-/// The faces of the smallest piece below `least` that has a neighbour, and the label it shares most edges
-/// with.
+/// The faces of the smallest piece below `least` that has a neighbour, and the label with which it
+/// shares most edges.
 fn smallest_crumb(
     mesh: &TriMesh,
     labels: &[i32],
@@ -119,7 +119,7 @@ mod tests {
         };
         let near = across(&tetrahedron);
         assert_eq!(near, [[3, 2, 1], [0, 2, 3], [0, 3, 1], [0, 1, 2]]);
-        // Outvoted by all three; with two of its own kind beside it a face keeps its label.
+        // Outvoted by all three neighbours; a face with two neighbours of its own label keeps it.
         assert_eq!(straightened(&[7, 1, 1, 1], &near), [1, 1, 1, 1]);
     }
 }

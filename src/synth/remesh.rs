@@ -1,24 +1,26 @@
-//! A closed mesh of an implicit surface becomes one of even triangles and of a given number of faces.
+//! Remeshes a closed mesh of an implicit surface to even triangles and a given number of faces.
 //!
-//! Incremental remeshing (M. Botsch and L. Kobbelt, "A remeshing approach to multiresolution modeling",
-//! 2004): long edges are split, short ones collapsed, edges flipped towards valence six, vertices moved
-//! tangentially to the middle of their neighbours and back onto the zero set. Each step keeps the mesh a
-//! closed manifold of the same topology, so the result is as watertight as the input.
+//! Incremental remeshing (M. Botsch and L. Kobbelt, "A remeshing approach to multiresolution
+//! modeling", 2004): long edges are split, short ones collapsed, edges flipped towards valence six,
+//! and vertices moved tangentially to the middle of their neighbours and back onto the zero set.
+//! Each step keeps the mesh a closed manifold of the same topology, so the result is as watertight
+//! as the input.
 
 use super::field::Scene;
 use super::vector::{Vec3, along, cross, dot, mix, norm, sub, unit};
 use crate::mesh::TriMesh;
 
-/// Rounds of split, collapse, flip and smooth; the shape of triangles no longer changes after about four.
+/// Rounds of split, collapse, flip and smooth; the shape of triangles is stable after about four.
 const N_ROUNDS: usize = 4;
 /// Rounds after the number of faces is reached.
 const N_FINAL_ROUNDS: usize = 3;
 /// Least cosine between a face before and after a step.
 const LEAST_COSINE: f64 = 0.3;
 
-/// An edge whose middle is nearer to the surface than this share of its length follows it well enough.
+/// An edge follows the surface well enough if its middle is nearer to the surface than this share
+/// of its length.
 const LEAST_GAP: f64 = 0.02;
-/// Aligning makes no angle smaller than that of this sine, 22°.
+/// Aligning makes no angle smaller than the angle of this sine, 22°.
 const LEAST_SINE: f64 = 0.375;
 
 /// Step of difference quotients, in edge lengths.
@@ -26,7 +28,7 @@ const STEP: f64 = 1e-3;
 
 struct Mesh<'a> {
     scene: &'a Scene,
-    /// Length that edges should have.
+    /// Target length of edges.
     target: f64,
     vertices: Vec<Vec3>,
     /// Corners; a dead face has three equal ones.
@@ -36,8 +38,8 @@ struct Mesh<'a> {
     n_faces: usize,
 }
 
-/// Remeshes `mesh`, whose vertices are near the zero set of `scene`, to `n_faces` triangles (one less when
-/// odd). Where thin parts do not allow fewer without changing the topology, more are left.
+/// Remeshes `mesh`, whose vertices are near the zero set of `scene`, to `n_faces` triangles (one
+/// less if odd). More remain where thin parts cannot have fewer without a change of the topology.
 pub(super) fn remesh(mesh: TriMesh, scene: &Scene, n_faces: usize) -> TriMesh {
     let area: f64 = mesh
         .faces
@@ -109,7 +111,7 @@ impl Mesh<'_> {
     fn edges_by_length(&self) -> Vec<(f64, [u32; 2])> {
         let mut edges: Vec<(f64, [u32; 2])> = Vec::with_capacity(self.n_faces * 3 / 2);
         for &[a, b, c] in &self.faces {
-            // Each edge is met in both directions, since the mesh is closed and oriented.
+            // Each edge is found in both directions, since the mesh is closed and oriented.
             let ascending = [[a, b], [b, c], [c, a]].into_iter().filter(|[u, v]| u < v);
             edges.extend(ascending.map(|e| (self.length(e), e)));
         }
@@ -117,7 +119,8 @@ impl Mesh<'_> {
         edges
     }
 
-    /// The two faces at an edge, that with a→b first, and their third corners; `None` once it is gone.
+    /// The two faces at an edge, the one with a→b first, and their third corners; `None` for an
+    /// edge that was removed.
     fn sides(&self, [a, b]: [u32; 2]) -> Option<([u32; 2], [u32; 2])> {
         let (mut faces, mut thirds) = ([u32::MAX; 2], [0; 2]);
         for &f in &self.around[a as usize] {
@@ -135,7 +138,8 @@ impl Mesh<'_> {
     }
 
     fn neighbours(&self, v: u32) -> Vec<u32> {
-        // Around a vertex of a closed oriented manifold each neighbour follows v in exactly one face.
+        // Around a vertex of a closed oriented manifold each neighbour follows v in exactly one
+        // face.
         let faces = self.around[v as usize]
             .iter()
             .map(|&f| self.faces[f as usize]);
@@ -166,7 +170,7 @@ impl Mesh<'_> {
             return;
         };
         let m = self.vertices.len() as u32;
-        // Smoothing, which follows, brings it onto the surface.
+        // Smoothing follows, and moves it onto the surface.
         self.vertices.push(mix(self.at(a), self.at(b), 0.5));
         self.around.push(Vec::with_capacity(6));
         for ((f, c), (from, to)) in faces.into_iter().zip(thirds).zip([(a, b), (b, a)]) {
@@ -181,7 +185,7 @@ impl Mesh<'_> {
         self.n_faces += 2;
     }
 
-    /// Collapses edges, shortest first, while more than `least` faces are left.
+    /// Collapses edges, shortest first, while more than `least` faces remain.
     fn collapse_shorter_than(&mut self, limit: f64, least: usize) {
         for (length, edge) in self.edges_by_length() {
             if length >= limit || self.n_faces <= least {
@@ -197,7 +201,8 @@ impl Mesh<'_> {
         let Some((dead, thirds)) = self.sides([a, b]) else {
             return;
         };
-        // The link condition: the topology stays if the two share no neighbours but those across the edge.
+        // The link condition: the topology is preserved if the two share only the neighbours across
+        // the edge.
         let near_a = self.neighbours(a);
         let near_b = self.neighbours(b);
         let shared = near_a.iter().filter(|v| near_b.contains(v)).count();
@@ -267,8 +272,8 @@ impl Mesh<'_> {
         }
     }
 
-    /// Flips edges that cut through the solid, or bridge a hollow, to the other diagonal if that stays
-    /// nearer to the surface: along rounded edges and thin tubes that is the one along the edge.
+    /// Flips edges that cut through the solid, or bridge a hollow, to the other diagonal if that
+    /// one is nearer to the surface. On rounded edges and thin tubes it is the lengthwise diagonal.
     fn align(&mut self) {
         for (_, edge) in self.edges_by_length() {
             let Some((faces, [c, d])) = self.sides(edge) else {
@@ -300,7 +305,7 @@ impl Mesh<'_> {
         }
     }
 
-    /// The sine of a face's least angle.
+    /// The sine of a face's smallest angle.
     fn least_sine(&self, face: &[u32; 3]) -> f64 {
         let [a, b, c] = face.map(|v| self.at(v));
         let mut sides = [norm(sub(b, a)), norm(sub(c, b)), norm(sub(a, c))];
@@ -308,7 +313,7 @@ impl Mesh<'_> {
         norm(double_area(&self.vertices, face)) / (sides[1] * sides[2])
     }
 
-    /// Puts the two faces across the other diagonal c-d in the place of those at the edge a-b.
+    /// Replaces the two faces at the edge a-b by the two at the other diagonal c-d.
     fn replace(
         &mut self,
         [f, g]: [u32; 2],
@@ -323,7 +328,7 @@ impl Mesh<'_> {
         self.around[d as usize].push(f);
     }
 
-    /// Whether the second edge is the longer one by a margin, so that flips cannot go to and fro.
+    /// Whether the second edge is the longer one by a margin, so that flips cannot oscillate.
     fn is_longer_than(&self, short: [u32; 2], long: [u32; 2]) -> bool {
         self.length(long) > 1.05 * self.length(short)
     }
@@ -358,8 +363,8 @@ impl Mesh<'_> {
         }
     }
 
-    /// The zero set near `p`, by Newton steps along the gradient, none longer than half an edge. `g` is a
-    /// gradient from nearby, good enough for the first step.
+    /// The zero set near `p`, by Newton steps along the gradient, each at most half an edge long.
+    /// `g` is a gradient from nearby, accurate enough for the first step.
     fn onto_surface(&self, mut p: Vec3, mut g: Vec3) -> Vec3 {
         for i in 0..4 {
             let value = self.scene.value(p);
@@ -369,7 +374,7 @@ impl Mesh<'_> {
             if i > 0 {
                 g = self.scene.gradient(p, STEP * self.target);
             }
-            // Where the gradient all but vanishes (between two parts), its direction says nothing.
+            // Where the gradient almost vanishes (between two parts), its direction is meaningless.
             let slope2 = dot(g, g).max(0.1);
             let limit = 0.5 * self.target / slope2.sqrt();
             p = along(p, g, -(value / slope2).clamp(-limit, limit));
@@ -377,7 +382,7 @@ impl Mesh<'_> {
         p
     }
 
-    /// Without the dead; vertices keep their order.
+    /// Removes dead faces; vertices keep their order.
     fn compact(self) -> TriMesh {
         let mut index = vec![u32::MAX; self.vertices.len()];
         let mut mesh = TriMesh::default();

@@ -1,4 +1,4 @@
-//! A primitive becomes its signed distance: exact, or to first order exact at the surface.
+//! Computes the signed distance of a primitive: exact, or exact to first order at the surface.
 //!
 //! After I. Quilez, "Distance functions".
 
@@ -9,24 +9,27 @@ use super::vector::{Frame, Vec3, along, dot, norm, scale, sub};
 pub(super) enum Solid {
     /// The hull of two spheres.
     Cone { a: Vec3, b: Vec3, ra: f64, rb: f64 },
-    /// The hulls of neighbouring balls along a curve, their radii going evenly from `ra` to `rb`.
+    /// The hulls of neighbouring balls along a curve, whose radii change linearly from `ra` to
+    /// `rb`.
     Tube { points: Vec<Vec3>, ra: f64, rb: f64 },
     /// Half axes along the frame.
     Ellipsoid { frame: Frame, radii: Vec3 },
-    /// Half sizes without the rounding, which is added outside.
+    /// A box with half sizes that exclude the rounding, which is added outside.
     Block {
         frame: Frame,
         half: Vec3,
         round: f64,
     },
-    /// A closed polygon in the frame's first two axes, `half` thick along the third, plus the rounding.
+    /// A closed polygon in the frame's first two axes, `half` thick along the third, plus the
+    /// rounding.
     Plate {
         frame: Frame,
         outline: Vec<[f64; 2]>,
         half: f64,
         round: f64,
     },
-    /// All within `round` of the curve (radius, height) turned around the frame's second axis.
+    /// All points within `round` of the curve (radius, height) turned around the frame's second
+    /// axis.
     Shell {
         frame: Frame,
         profile: Vec<[f64; 2]>,
@@ -42,7 +45,7 @@ pub(super) enum Solid {
 }
 
 impl Solid {
-    /// Signed distance, negative inside; near the surface right to first order.
+    /// Signed distance, negative inside; exact to first order near the surface.
     pub(super) fn distance(&self, p: Vec3) -> f64 {
         match self {
             Self::Cone { a, b, ra, rb } => cone(p, *a, *b, *ra, *rb),
@@ -105,7 +108,7 @@ impl Solid {
         }
     }
 
-    /// Radius of the largest ball that fits its thinnest place.
+    /// Radius of the largest ball that fits into its thinnest part.
     pub(super) fn thickness(&self) -> f64 {
         match self {
             Self::Cone { ra, rb, .. } | Self::Tube { ra, rb, .. } => ra.min(*rb),
@@ -122,7 +125,7 @@ impl Solid {
         }
     }
 
-    /// A ball that holds it.
+    /// A ball that contains it.
     pub(super) fn ball(&self) -> Ball {
         match self {
             Self::Cone { a, b, ra, rb } => Ball::around(&[*a, *b], ra.max(*rb)),
@@ -171,7 +174,7 @@ impl Solid {
     }
 }
 
-/// A bound on where a solid is, so that far ones need not be evaluated.
+/// A bound on the extent of a solid, so that distant ones need not be evaluated.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ball {
     centre: Vec3,
@@ -179,7 +182,7 @@ pub(super) struct Ball {
 }
 
 impl Ball {
-    /// Holds all points, and `margin` around them.
+    /// The ball around all points with `margin`.
     fn around(points: &[Vec3], margin: f64) -> Self {
         let bound = |pick: fn(f64, f64) -> f64, k: usize| {
             points
@@ -199,30 +202,30 @@ impl Ball {
         }
     }
 
-    /// Holds both.
+    /// The ball around both.
     pub(super) fn with(self, other: Self) -> Self {
-        let apart = norm(sub(other.centre, self.centre));
-        if apart + other.radius <= self.radius {
+        let distance = norm(sub(other.centre, self.centre));
+        if distance + other.radius <= self.radius {
             return self;
         }
-        if apart + self.radius <= other.radius {
+        if distance + self.radius <= other.radius {
             return other;
         }
-        let radius = (apart + self.radius + other.radius) / 2.0;
-        let t = (radius - self.radius) / apart;
+        let radius = (distance + self.radius + other.radius) / 2.0;
+        let t = (radius - self.radius) / distance;
         Self {
             centre: along(self.centre, sub(other.centre, self.centre), t),
             radius,
         }
     }
 
-    /// No solid in it is nearer to `p`.
+    /// Lower bound on the distance of a contained solid from `p`.
     pub(super) fn distance(&self, p: Vec3) -> f64 {
         norm(sub(p, self.centre)) - self.radius
     }
 }
 
-/// Distance to the intersection of two half spaces whose boundaries are at right angles.
+/// Distance to the intersection of two half spaces with perpendicular boundaries.
 fn slab(u: f64, v: f64) -> f64 {
     let (x, y) = (u.max(0.0), v.max(0.0));
     u.max(v).min(0.0) + (x * x + y * y).sqrt()
@@ -234,7 +237,7 @@ fn cone(p: Vec3, a: Vec3, b: Vec3, ra: f64, rb: f64) -> f64 {
     let taper = ra - rb;
     let cos2 = length2 - taper * taper;
     if cos2 <= 0.0 {
-        // One ball holds the other.
+        // One ball contains the other.
         return (norm(sub(p, a)) - ra).min(norm(sub(p, b)) - rb);
     }
     let pa = sub(p, a);
@@ -260,7 +263,7 @@ fn ellipsoid(q: Vec3, radii: Vec3) -> f64 {
     let (level, slope) = (norm(u), norm(v));
     let smallest = radii[0].min(radii[1]).min(radii[2]);
     if level < 0.5 {
-        // The quotient below is not defined at the centre.
+        // The quotient below is undefined at the centre.
         return (level - 1.0) * smallest;
     }
     level * (level - 1.0) / slope
@@ -390,7 +393,7 @@ mod tests {
                         far = mid
                     }
                 }
-                // Central differences; the distances are smooth but for corners.
+                // Central differences; the distances are smooth except at corners.
                 let step = 1e-6;
                 let g = [0, 1, 2].map(|k| {
                     let (mut p, mut q) = (at(far), at(far));

@@ -1,9 +1,11 @@
-//! A smooth function of space becomes the closed triangle mesh of its zero set, in lattice resolution.
+//! Meshes the zero set of a smooth function of space as a closed triangle mesh, at lattice
+//! resolution.
 //!
-//! Marching tetrahedra on the Kuhn subdivision of a cubic lattice, followed from a seed cube to cube across
-//! faces the surface crosses (J. Bloomenthal, "An implicit surface polygonizer", 1994). Tetrahedra leave no
-//! ambiguous case, so the mesh is closed, edge-manifold and outward-oriented whatever the function;
-//! following the surface costs in proportion to its area and yields one component.
+//! Marching tetrahedra on the Kuhn subdivision of a cubic lattice, followed from a seed cube to
+//! cube across faces that the surface crosses (J. Bloomenthal, "An implicit surface polygonizer",
+//! 1994). Tetrahedra leave no ambiguous case, so the mesh is closed, edge-manifold and
+//! outward-oriented for any function. Following the surface costs in proportion to its area and
+//! yields one component.
 
 use super::vector::{Vec3, mix};
 use crate::mesh::TriMesh;
@@ -11,16 +13,17 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::hash::{BuildHasherDefault, Hasher};
 
-/// A lattice node, 20 bits an axis.
+/// A lattice node, 20 bits for each axis.
 type Node = [i32; 3];
 
-/// Half the number of nodes an axis may have.
+/// Half the maximum number of nodes of an axis.
 const REACH: i32 = 1 << 19;
 
-/// Where a crossing may lie on its edge; nearer to a node it would make triangles without area.
+/// Least distance of a crossing from a node, relative to its edge; nearer crossings would make
+/// triangles without area.
 const MARGIN: f64 = 0.05;
 
-/// Spreads packed lattice nodes; they come from inside, so no attacker chooses them.
+/// Hashes packed lattice nodes; they are internal, so no attacker chooses them.
 #[derive(Default)]
 struct NodeHasher(u64);
 
@@ -89,10 +92,10 @@ const TETRAHEDRA: [[usize; 4]; 6] = [
     [0, 5, 1, 7],
 ];
 
-/// The component of `value = 0` that is met first on the way from `seed` along the first axis, with cubes
-/// of side `cell`. `None` when no surface is met within `reach`.
+/// The component of `value = 0` that is first on the way from `seed` along the first axis, with
+/// cubes of side `cell`. `None` if there is no surface within `reach`.
 ///
-/// `value` must be negative inside a bounded region. Thinner features than a cell may be lost.
+/// `value` must be negative inside a bounded region. Features thinner than a cell may be lost.
 pub(super) fn surface(
     value: impl Fn(Vec3) -> f64,
     seed: Vec3,
@@ -129,7 +132,8 @@ pub(super) fn surface(
         }
         let mut vertex = |a: usize, b: usize| {
             let (a, b) = (a.min(b), a.max(b));
-            // Along a Kuhn edge the steps only grow, so its lower node and its steps name it.
+            // Along a Kuhn edge the steps only increase, so its lower node and its steps identify
+            // it.
             let key = pack(corner(cube, a)) << 3 | (b ^ a) as u64;
             *crossing.entry(key).or_insert_with(|| {
                 let t = (values[a] / (values[a] - values[b])).clamp(MARGIN, 1.0 - MARGIN);
@@ -165,7 +169,7 @@ fn crossed(values: &[f64; 8], mask: u32) -> bool {
     inside != 0 && inside != mask
 }
 
-/// How many corners are inside, and the corners in an order of positive volume with those first.
+/// The number of corners inside, and the corners in an order of positive volume with those first.
 fn inside_first(mut t: [usize; 4], values: &[f64; 8]) -> (usize, [usize; 4]) {
     let mut n_inside = 0;
     let mut odd = false;
@@ -177,7 +181,8 @@ fn inside_first(mut t: [usize; 4], values: &[f64; 8]) -> (usize, [usize; 4]) {
         }
     }
     if odd {
-        // Swapping two on the same side keeps the sorting; with 1 or 2 inside the last two are outside.
+        // Swapping two corners on the same side keeps them sorted; with 1 or 2 inside the last two
+        // are outside.
         if n_inside <= 2 {
             t.swap(2, 3)
         } else {
@@ -199,7 +204,8 @@ mod tests {
         check::closed_manifold(&mesh);
         assert_eq!(check::euler_characteristic(&mesh), 2);
         let volume = check::volume(&mesh);
-        // A lattice of 0.1 cuts off about curvature·cell²/8 of depth; MARGIN adds noise of its size.
+        // A lattice of 0.1 cuts off about curvature·cell²/8 of depth; MARGIN adds noise of this
+        // size.
         assert!((volume - 4.18879).abs() < 0.06, "{volume}");
     }
 
@@ -213,7 +219,7 @@ mod tests {
 
     #[test]
     fn noise_still_gives_a_manifold() {
-        // Values without any smoothness: every case of every tetrahedron occurs.
+        // These values are not smooth, so every case of every tetrahedron occurs.
         let noise = |p: [f64; 3]| {
             let key = p.iter().fold(1u64, |k, x| {
                 (k ^ ((x * 16.0).round() as i64 as u64)).wrapping_mul(0x9e37_79b9_7f4a_7c15)

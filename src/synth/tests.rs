@@ -1,4 +1,5 @@
-//! What every family owes its users: closed shapes, all their labels, the same bytes for the same seed.
+//! Tests properties of every family: closed shapes, all labels present, the same bytes for the same
+//! seed.
 
 use super::dice::Dice;
 use super::{Family, LEAST_FACES, Labelled, Options, check, family, generate};
@@ -7,10 +8,10 @@ use crate::mesh::write::off;
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
-/// Members of each family that are looked at.
+/// Number of members of each family in the tests.
 const COUNT: u32 = 8;
 
-/// Some seed.
+/// An arbitrary seed.
 const SEED: u64 = 3;
 
 /// The members of every family, generated once for all tests.
@@ -34,7 +35,7 @@ fn used(shape: &Labelled) -> Vec<u32> {
         .collect()
 }
 
-/// How many connected pieces have a label.
+/// Number of connected pieces with a label.
 fn n_pieces(shape: &Labelled, label: u32) -> usize {
     let labels: Vec<i32> = shape.labels.iter().map(|l| *l as i32).collect();
     let of = pieces(&shape.mesh.faces, &labels);
@@ -164,8 +165,8 @@ fn a_container_has_as_many_holes_as_handles() {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes() {
-    // These digests were taken on x86-64; another machine must agree. Whoever changes a grammar on
-    // purpose replaces them.
+    // These digests were computed on x86-64; other machines must agree. A deliberate change of a
+    // grammar must replace them.
     let digests = Family::ALL.map(|kind| {
         let shape = generate(
             kind,

@@ -1,7 +1,8 @@
-//! Points, frames and angles of the shape grammar, in arithmetic that gives the same bits on every machine.
+//! Provides points, frames and angles for generated shapes, in arithmetic that gives the same bits
+//! on every machine.
 //!
-//! Only `+ - * /` and `sqrt` are used, which IEEE 754 rounds correctly; sine and cosine, whose last bit
-//! depends on the platform's mathematics library, are polynomials here.
+//! Only `+ - * /` and `sqrt` are used, which IEEE 754 rounds correctly. Sine and cosine are
+//! polynomials here, because their last bit depends on the platform's mathematics library.
 
 /// A point or a direction.
 pub(super) type Vec3 = [f64; 3];
@@ -70,7 +71,8 @@ pub(super) fn sin_cos(degrees: f64) -> (f64, f64) {
     }
 }
 
-/// The unit vector in the plane of `a` and `b` that is `degrees` from `a` towards `b` (orthonormal both).
+/// The unit vector in the plane of `a` and `b` that is `degrees` from `a` towards `b`; both must be
+/// orthonormal.
 pub(super) fn turn(a: Vec3, b: Vec3, degrees: f64) -> Vec3 {
     let (s, c) = sin_cos(degrees);
     along(scale(a, c), b, s)
@@ -92,7 +94,8 @@ impl Frame {
         }
     }
 
-    /// The frame at `origin` whose second axis is `y`, and whose third is as near to `z` as can be.
+    /// The frame at `origin` whose second axis is `y`, and whose third axis is as near to `z` as
+    /// possible.
     pub(super) fn facing(origin: Vec3, y: Vec3, z: Vec3) -> Self {
         let y = unit(y);
         let x = unit(cross(y, z));
@@ -102,7 +105,7 @@ impl Frame {
         }
     }
 
-    /// Turned in its own plane of axes `i` and `j`, from `i` towards `j`.
+    /// The frame, turned in the plane of its axes `i` and `j`, from `i` towards `j`.
     pub(super) fn turned(mut self, i: usize, j: usize, degrees: f64) -> Self {
         let (a, b) = (self.axes[i], self.axes[j]);
         self.axes[i] = turn(a, b, degrees);

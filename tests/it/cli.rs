@@ -1,4 +1,4 @@
-//! The command line: what it prints, what it writes, and how it exits.
+//! Tests the output, the files and the exit codes of the command line.
 
 mod messages;
 mod terminal;
@@ -11,7 +11,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 
-/// A home with a folder of three meshes and what lies beside meshes.
+/// A home with a folder of three meshes and other files beside them.
 fn home_with_folder() -> (Home, String) {
     let home = Home::new();
     let folder = home.path("meshes");
@@ -97,7 +97,7 @@ fn no_daemon_exits_3_in_time_and_says_so() {
     let said = stderr(&output);
     let expected = format!(
         "coseg: no answer from {} within 0.3 s; is a daemon running there?\n  \
-         start one with `coseg serve`, or say where it is with --endpoint\n",
+         start one with `coseg serve`, or give its address with --endpoint\n",
         home.endpoint()
     );
     assert_eq!(said, expected);
@@ -139,7 +139,7 @@ fn the_configuration_is_checked_and_shown() {
     assert_eq!(shown["in_use"]["library"], library);
     assert_eq!(shown["in_use"]["workers"], 3);
     assert_eq!(shown["settings"]["limits"]["memory"], "2GiB");
-    // What is shown is a configuration file.
+    // The output is a valid configuration file.
     let text = stdout(&run(&["config", "show", "--config", &file], &[]), 0);
     let again = home.mesh("again.toml", &text);
     assert_eq!(
@@ -212,7 +212,7 @@ fn a_folder_becomes_labelled_shapes_and_files() {
             > 0.0
     );
 
-    // The same again, with settings that are those of the collection, or with none.
+    // The same command again, with the settings of the collection, or with none.
     let again = home.coseg(&[
         "add",
         &folder,
@@ -343,7 +343,7 @@ fn shapes_are_compared_named_and_removed() {
     let events = events["events"].as_array().unwrap().clone();
     assert_eq!(events[0]["kind"], "collection_created");
     assert_eq!(events.last().unwrap()["kind"], "label_named");
-    // All that were, then it ends.
+    // The command prints all past events, then ends.
     let n = events.len().to_string();
     let watched = home.coseg(&[
         "watch",
@@ -391,7 +391,7 @@ fn one_refused_shape_fails_the_command_and_not_the_others() {
         "{said}"
     );
     assert!(said.contains("default: 1 added, 1 failed in "), "{said}");
-    // Other bytes under the name are refused, or replace it.
+    // Other bytes under the same name are refused, or replace the shape.
     home.mesh("good.off", &skittle(1));
     let taken = json(&home.coseg(&["add", &good, "--json"]), 1);
     assert_eq!(taken["shapes"][0]["error"]["code"], "ALREADY_EXISTS");
@@ -452,7 +452,7 @@ fn a_library_is_checked_with_and_without_a_daemon() {
         (&good["ok"], &good["findings"]),
         (&true.into(), &serde_json::json!([]))
     );
-    // Damage is found.
+    // The damage is found.
     let objects = home.path("library/objects");
     let file = files_below(&objects)
         .into_iter()

@@ -1,4 +1,4 @@
-//! A person corrects labels: they are pinned, carried to all other shapes, and can be undone.
+//! Tests corrections: labels are pinned, propagated to all other shapes, and can be undone.
 
 use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
 use coseg::Library;
@@ -6,7 +6,7 @@ use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, RequestKey, 
 use coseg::synth::{Family, Labelled, family};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Known parts as labels that no discovery would number so.
+/// Known parts as labels that no discovery would number like this.
 fn truth(shape: &Labelled) -> Vec<i32> {
     shape.labels.iter().map(|l| *l as i32 + 10).collect()
 }
@@ -83,7 +83,7 @@ fn one_corrected_shape_labels_all_others_by_its_ids() {
             .all(|k| matches!(k, EventKind::LabelsChanged { .. }))
     );
 
-    // Shapes that come later have the same ids, also after the library was closed.
+    // Shapes that are added later have the same ids, also after the library was closed.
     let before = all_labels(&library);
     drop(library);
     let library = Library::open(folder.path()).unwrap();
@@ -110,7 +110,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     carry(&library);
     states.push(snapshot(&library));
     library.name_label(COLLECTION, 11, "jaw", None).unwrap();
-    // Not carried to the end: what is undone need not be finished.
+    // An unfinished propagation can be undone.
     correct(&library, &shapes[1]);
     library.relabel_next(Some(COLLECTION)).unwrap();
     library.merge_labels(COLLECTION, 11, 12, None).unwrap();
@@ -128,7 +128,8 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     assert_eq!(name(11).as_deref(), Some("jaw"));
     assert_eq!(undo().change, "name");
     assert_eq!(name(11), None);
-    // A shape that came after the correction is labelled by what was discovered, when that is undone.
+    // After the undo, a shape that was added after the correction is labelled by the discovered
+    // labels.
     stream(&library, &shapes[5..]);
     let last = undo();
     assert_eq!((last.change.as_str(), last.n_left), ("correct", 0));
@@ -148,7 +149,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
         ),
         "{nothing:?}"
     );
-    // And the collection lives on.
+    // The collection remains usable.
     correct(&library, &shapes[2]);
     carry(&library);
     assert!(right(&library, &shapes, &[&shapes[2].name]) > 0.8);
@@ -159,7 +160,7 @@ fn pinned_faces_never_change_by_themselves() {
     let shapes = family(Family::Pliers, 23, 12, &SMALL);
     let (folder, library) = library(3, Up::Unknown);
     stream(&library, &shapes[..4]);
-    // A tenth of one shape, at random as far as its parts are concerned.
+    // A tenth of one shape, at random with respect to its parts.
     let faces: Vec<u32> = (0..shapes[1].labels.len() as u32).step_by(10).collect();
     let some = Correction::Faces {
         faces: faces.clone(),
@@ -351,7 +352,7 @@ fn labels_are_merged_and_split_on_all_shapes() {
     assert!(kinds(&library, since).contains(&split));
     let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
     assert_eq!(used, BTreeSet::from([11, 12, new.id as i32]));
-    // What the person had labelled otherwise stays.
+    // Other labels by the person stay.
     let exemplar = &all_labels(&library)[&shapes[0].name];
     for (now, was) in exemplar.iter().zip(&before[&shapes[0].name]) {
         assert_eq!(*now == 12, *was == 12);
@@ -459,7 +460,8 @@ fn any_order_of_arrival_ends_within_a_point_of_the_batch() {
         carry(&library);
         right(&library, &shapes, &[&shapes[0].name])
     };
-    // All shapes are known when the person speaks; against: the first of a stream, forwards and backwards.
+    // Compares corrections after all shapes are known with corrections of the first shape of a
+    // stream, forwards and backwards.
     let batch = run(&[0, 1, 2, 3, 4, 5, 6, 7], 7);
     let streamed = [
         run(&[0, 1, 2, 3, 4, 5, 6, 7], 0),

@@ -1,4 +1,4 @@
-//! The daemon over its real sockets.
+//! Tests the daemon over its real sockets.
 
 mod adding;
 mod answering;
@@ -25,7 +25,7 @@ use coseg::ipc::wire::{
 };
 use prost::Message as _;
 
-/// A socket that sends whatever it likes.
+/// A socket that sends arbitrary frames.
 fn raw(kind: zmq::SocketType, endpoint: &str) -> zmq::Socket {
     let socket = zmq::Context::new().socket(kind).unwrap();
     socket.set_linger(0).unwrap();
@@ -73,7 +73,7 @@ fn events_after(client: &mut Client, collection: &str, sequence: u64) -> Vec<wir
     call!(client, EventsSince(request)).unwrap().events
 }
 
-/// Adds without settings of the collection.
+/// Adds shapes without settings of the collection.
 fn add_again(client: &mut Client, collection: &str, name: &str, text: &str) -> wire::Job {
     let (request, frames) = additions(collection, &[(name, text)], wire::AddMode::Wait);
     call!(client, AddShapes(request), frames, with_frames)
@@ -124,7 +124,7 @@ fn junk_gets_an_error_and_the_daemon_lives() {
         assert_eq!(error.code(), ErrorCode::InvalidArgument);
         assert_eq!(error.reason(), ErrorReason::MalformedMessage);
     }
-    // Length-delimited fields of unknown number, one inside the other.
+    // Nested length-delimited fields with unknown numbers.
     let mut deep = Vec::new();
     for _ in 0..1_000 {
         let mut outer = vec![0xa2, 0x06]; // field 100
@@ -198,7 +198,7 @@ fn oversized_messages_are_refused_and_others_are_served() {
         raw_error(&dealer, &many).reason(),
         ErrorReason::MessageTooLarge
     );
-    // A frame beyond the limit ends that connection; no other notices.
+    // A frame beyond the limit ends that connection; others are not affected.
     raw(zmq::DEALER, &home.endpoint())
         .send(vec![0_u8; 1 << 20], 0)
         .unwrap();
@@ -317,7 +317,7 @@ fn events_arrive_in_order_and_are_those_of_the_log() {
             wire::Event::decode(frames[1].as_slice()).unwrap(),
         )
     };
-    // The first heartbeat shows that the subscription is there, and where the logs stand.
+    // The first heartbeat shows that the subscription works, and the ends of the logs.
     let (topic, heartbeat) = next();
     assert_eq!(topic, b"\0");
     let Some(Kind::Heartbeat(heartbeat)) = heartbeat.kind else {
@@ -386,6 +386,6 @@ fn removing_and_deleting_are_in_the_log() {
         kinds.last(),
         Some(&Kind::CollectionDeleted(wire::CollectionDeleted {}))
     );
-    // The name can be used again, and its log goes on.
+    // The name can be used again, and its log continues.
     assert_eq!(create(client, "c").sequence, kinds.len() as u64 + 1);
 }

@@ -1,4 +1,4 @@
-//! Files of every format in, labels in every format out, and what is found in the wild.
+//! Tests input files of every format, labels in every format, and files found in the wild.
 
 use crate::harness::{Home, SKITTLE_FACES, json, messy_files, skittle, stdout};
 use coseg::library::{CollectionSpec, LibraryError, NewShape};
@@ -74,7 +74,7 @@ fn every_format_comes_in_and_goes_out_with_its_labels() {
         assert_eq!(value["labels"], serde_json::json!(labels));
         assert_eq!(value["names"]["-1"], "unlabelled");
 
-        // The meshes have the faces of the file, in its order, but for GLB.
+        // The meshes have the faces of the file, in its order, except for GLB.
         let original = home.path("meshes").join(match name {
             "a" => "a.off",
             "b" => "b.obj",
@@ -91,7 +91,7 @@ fn every_format_comes_in_and_goes_out_with_its_labels() {
                 "{name}{ending}"
             );
         }
-        // The label is what a face's record ends with.
+        // The label is at the end of a face's record.
         let ply = file(".ply");
         let records = &ply[ply.len() - 20 * SKITTLE_FACES..];
         let of_records = records
@@ -109,7 +109,7 @@ fn every_format_comes_in_and_goes_out_with_its_labels() {
     }
 }
 
-/// Labels by the groups that faces are in.
+/// The labels of faces, by their groups.
 fn labels_of_obj(text: &str) -> Vec<i32> {
     let mut label = -1;
     let mut labels = Vec::new();
@@ -123,7 +123,8 @@ fn labels_of_obj(text: &str) -> Vec<i32> {
     labels
 }
 
-/// Labels by what a GLB's primitives say of the polygons they have; their triangles must be the original's.
+/// The labels of the polygons that a GLB's primitives list; their triangles must equal those of the
+/// original.
 fn labels_of_glb(bytes: &[u8], found: &ParsedMesh, original: &ParsedMesh) -> Vec<i32> {
     let n_json = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
     let root: serde_json::Value = serde_json::from_slice(&bytes[20..20 + n_json]).unwrap();
@@ -199,12 +200,12 @@ fn every_messy_file_is_labelled_or_refused_with_a_reason() {
             Err(e) => panic!("{file}: {e}"),
         }
     }
-    // All that are there can be labelled.
+    // All existing faces can be labelled.
     assert_eq!(n_labelled, paths.len());
 }
 
-/// A chair whose parts are loose pieces, each closed, is one shape: pieces are joined for the analysis,
-/// reported, and labelled as those of a chair that is all of one piece.
+/// A chair of loose, closed pieces is one shape: the pieces are joined for the analysis, reported,
+/// and labelled like those of a chair in one piece.
 #[test]
 fn a_chair_of_loose_pieces_is_one_shape() {
     let (_folder, library) = library();
@@ -255,7 +256,7 @@ fn a_chair_of_loose_pieces_is_one_shape() {
         assert!(shape.report.n_bridges >= 7);
         let labels = library.labels("all", &shape.name, None).unwrap().labels;
         assert_eq!(labels.len(), 8 * 6);
-        // The four legs are alike; a board has one label.
+        // The four legs have equal labels; a board has one label.
         for piece in labels.chunks(6) {
             let most = piece.iter().filter(|l| **l == piece[0]).count();
             assert!(most >= 5, "{labels:?}");
@@ -268,7 +269,8 @@ fn a_chair_of_loose_pieces_is_one_shape() {
     }
 }
 
-/// Labels come back for each polygon, and a made shape's known parts survive as many formats as there are.
+/// Labels are returned for each polygon, and the known parts of a generated shape survive in every
+/// format.
 #[test]
 fn a_made_shape_reads_the_same_in_every_format() {
     let options = synth::Options {
@@ -320,7 +322,7 @@ fn faces_that_are_concave_have_their_area_and_one_label() {
     assert_eq!(shape.report.n_nonplanar_polygons, 0);
     assert_eq!(shape.report.n_boundary_edges, 0);
     assert_eq!(library.labels("all", "c", None).unwrap().labels.len(), 10);
-    // Twice the same is no other shape, also when it is to replace itself.
+    // The same file twice is no other shape, even when it replaces itself.
     let again = NewShape {
         name: "c".into(),
         bytes: bytes(),
@@ -331,7 +333,8 @@ fn faces_that_are_concave_have_their_area_and_one_label() {
     assert_eq!(placed.outcome, coseg::library::Outcome::Unchanged);
 }
 
-/// What programs differ about is read as its writer meant it, and the report says so.
+/// Statements that programs interpret differently are read as their writers intended, and the
+/// report lists them.
 #[test]
 fn odd_spellings_are_read_and_told() {
     let (_folder, library) = library();
@@ -401,7 +404,7 @@ fn a_file_that_is_no_mesh_is_named_whatever_its_suffix_says() {
     }
 }
 
-/// A box as OBJ, whose vertices come after `n` others.
+/// A box as OBJ whose vertices come after `n` others.
 fn box_obj(low: [f64; 3], high: [f64; 3], n: usize) -> String {
     let mut text = String::new();
     for i in 0..8 {
@@ -525,8 +528,14 @@ fn a_gltf_is_packed_with_the_buffers_beside_it() {
         "asset": { "version": "2.0" }, "scenes": [{ "nodes": [0] }], "nodes": [{ "mesh": 0 }],
         "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 }, "indices": 1 }] }],
         "accessors": [
-            { "bufferView": 0, "componentType": 5126, "count": mesh.vertices.len(), "type": "VEC3" },
-            { "bufferView": 1, "componentType": 5125, "count": 3 * mesh.triangles.len(), "type": "SCALAR" },
+            {
+                "bufferView": 0, "componentType": 5126, "count": mesh.vertices.len(),
+                "type": "VEC3"
+            },
+            {
+                "bufferView": 1, "componentType": 5125, "count": 3 * mesh.triangles.len(),
+                "type": "SCALAR"
+            },
         ],
         "bufferViews": [
             { "buffer": 0, "byteLength": n_positions },
@@ -541,11 +550,14 @@ fn a_gltf_is_packed_with_the_buffers_beside_it() {
     let missing = json(&home.coseg(&["add", &path, "--parts", "2", "--json"]), 1);
     let why = missing["shapes"][0]["error"]["message"].as_str().unwrap();
     assert!(
-        why.ends_with("buffer 0 is in \"a%20skittle.bin\", but the folder of the file has no file of that name"),
+        why.ends_with(
+            "buffer 0 is in \"a%20skittle.bin\", but the folder of the file has no file \
+                       of that name"
+        ),
         "{why}"
     );
     std::fs::write(folder.join("a skittle.bin"), bytes).unwrap();
-    // The buffer is no mesh file of the folder, and nothing is said of it.
+    // The buffer is not a mesh file of the folder, and is skipped silently.
     let output = home.coseg(&["add", &folder_name, "--parts", "2"]);
     stdout(&output, 0);
     assert!(!String::from_utf8_lossy(&output.stderr).contains("skipped"));
@@ -559,7 +571,7 @@ fn a_gltf_is_packed_with_the_buffers_beside_it() {
     assert_eq!(described["report"]["n_polygons"], SKITTLE_FACES);
 }
 
-/// The labels of an inner wall are those of the wall around it, and the wall takes no part in what is found.
+/// An inner wall has the labels of the wall around it, and is excluded from the findings.
 #[test]
 fn an_inner_wall_has_the_labels_of_the_one_around_it() {
     let options = synth::Options {
@@ -621,7 +633,7 @@ fn an_inner_wall_has_the_labels_of_the_one_around_it() {
             "{same} of {}",
             outer.len()
         );
-        // The outer wall has the labels it has alone, but for what rounding does at boundaries.
+        // The outer wall has the same labels as alone, except for rounding at boundaries.
         let alone = single.labels("all", &name, None).unwrap().labels;
         let same = outer.iter().zip(&alone).filter(|(a, b)| a == b).count();
         assert!(

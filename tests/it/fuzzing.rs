@@ -1,4 +1,4 @@
-//! What `fuzz/run.sh` begins with, and what it once found: tried again by the ordinary tests.
+//! Tests the seeds of `fuzz/run.sh` and its earlier findings.
 
 use coseg::mesh::{self, Format};
 use coseg::store::mapped::{MappedDescription, write_description};
@@ -7,19 +7,22 @@ use std::path::{Path, PathBuf};
 
 const OBJ: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf -1 -2 -4\n";
 const OFF: &str = "OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
-const PLY: &str = "ply\nformat ascii 1.0\ncomment x\nelement vertex 3\nproperty float x\nproperty float y\n\
-    property float z\nproperty uchar red\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n\
+const PLY: &str = "ply\nformat ascii 1.0\ncomment x\nelement vertex 3\nproperty float x\n\
+    property float y\nproperty float z\nproperty uchar red\nelement face 1\n\
+    property list uchar int vertex_indices\nend_header\n\
     0 0 0 1\n1 0 0 2\n0 1 0 3\n3 0 1 2\n";
-const STL: &str = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n\
-    endfacet\nendsolid x\n";
-const GLTF: &str = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0,
+const STL: &str = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n\
+    vertex 0 1 0\nendloop\nendfacet\nendsolid x\n";
+const GLTF: &str = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],
+    "nodes":[{"mesh":0,
     "children":[1],"scale":[1,2,1]},{"matrix":[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1],"mesh":0}],
     "meshes":[{"primitives":[{"attributes":{"POSITION":0},"mode":4}]}],
-    "accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}],
+    "accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3",
+        "min":[0,0,0],"max":[1,1,0]}],
     "bufferViews":[{"buffer":0,"byteLength":36,"byteOffset":0}],"buffers":[{"byteLength":36,"uri":
     "data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#;
 
-/// A small file of each format that is read; PLY and STL also binary, glTF also in one file.
+/// A small file of each supported format; PLY and STL also binary, glTF also in one file.
 fn meshes() -> Vec<(Format, Vec<u8>)> {
     let header = PLY.replace("ascii", "binary_little_endian");
     let (header, _) = header.split_at(header.find("0 0 0 1").unwrap());
@@ -73,7 +76,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Inputs that were found by fuzzing, and all that any spoilt header can be cut to.
+/// Inputs found by fuzzing, and all truncations of damaged headers.
 #[test]
 fn what_fuzzing_found_stays_mended() {
     let kept = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/kept");
@@ -107,7 +110,7 @@ fn what_fuzzing_found_stays_mended() {
     }
 }
 
-/// Writes what fuzzing begins with into the folder that `COSEG_TEST_SEEDS` names.
+/// Writes the seeds of fuzzing into the folder in `COSEG_TEST_SEEDS`.
 #[test]
 #[ignore = "writes files for fuzz/run.sh"]
 fn write_seeds() {

@@ -1,4 +1,5 @@
-//! Recorded conversations are held again with a fresh daemon: what was asked then is answered alike now.
+//! Recorded conversations are held again with a fresh daemon: what was asked then is answered alike
+//! now.
 //!
 //! The files are made by `tests/golden/record.py`; the clients in other languages replay them too.
 
@@ -26,8 +27,8 @@ fn frames(name: &str, what: &str) -> Vec<Vec<u8>> {
     frames
 }
 
-/// What of a reply does not depend on the processor, the version or the clock: which result it is; of a
-/// refusal all but its words; of shapes their outcomes; of arrays how many there are.
+/// What of a reply does not depend on the processor, the version or the clock: which result it is;
+/// of a refusal all but its words; of shapes their outcomes; of arrays how many there are.
 fn gist(frames: &[Vec<u8>]) -> String {
     let reply = Reply::decode(frames[0].as_slice()).unwrap();
     let name = |result: &reply::Result| {

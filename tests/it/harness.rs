@@ -1,4 +1,4 @@
-//! The real binary as a daemon in a folder of its own, and meshes to feed it.
+//! Runs the real binary as a daemon in a folder of its own, and provides meshes.
 
 use coseg::ipc::client::Client;
 use coseg::ipc::wire::{self, ErrorCode, ErrorReason, reply, request};
@@ -11,10 +11,11 @@ use std::sync::mpsc;
 use std::time::Duration;
 use tempfile::TempDir;
 
-/// Long enough for a machine that is busy with other tests; only a failing test waits so long.
+/// A time limit that suffices on a machine that is busy with other tests; only failing tests wait
+/// so long.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(60);
 
-/// The binary with nothing of this process's settings.
+/// The binary without settings of this process.
 pub(crate) fn coseg() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_coseg"));
     for (name, _) in std::env::vars_os() {
@@ -58,7 +59,7 @@ impl Home {
     pub(crate) fn coseg(&self, args: &[&str]) -> Output {
         let mut command = coseg();
         command.args(args).env("COSEG_ENDPOINT", self.endpoint());
-        // A test machine may be slow; what is tested with the default says so itself.
+        // A test machine may be slow; tests of the default timeout set it explicitly.
         if !args.contains(&"--timeout") {
             command.args(["--timeout", "60"]);
         }
@@ -76,14 +77,14 @@ impl Home {
         self.start_with(&[], &[])
     }
 
-    /// Starts a daemon and waits until it says that it is ready.
+    /// Starts a daemon and waits until it is ready.
     pub(crate) fn start_with(&self, args: &[&str], env: &[(&str, &str)]) -> Daemon {
         let mut daemon = self.spawn(args, env);
         daemon.await_notice("READY=1");
         daemon
     }
 
-    /// The same with so many open files at most.
+    /// The same with a limit on the number of open files.
     pub(crate) fn start_limited(&self, n_files: u64, args: &[&str]) -> Daemon {
         let limited = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
         let binary = coseg();
@@ -152,7 +153,7 @@ pub(crate) struct Daemon {
 }
 
 impl Daemon {
-    /// Waits for a message to the service manager that has this line.
+    /// Waits for a message to the service manager with this line.
     pub(crate) fn await_notice(&mut self, line: &str) -> String {
         let mut buffer = [0_u8; 4096];
         loop {
@@ -169,7 +170,7 @@ impl Daemon {
         }
     }
 
-    /// Waits for a line of stderr that has this text.
+    /// Waits for a line of stderr with this text.
     pub(crate) fn await_line(&mut self, text: &str) -> String {
         loop {
             let line = self.lines.recv_timeout(DEADLINE);
@@ -247,7 +248,7 @@ pub(crate) fn add_request(
     (request::Body::AddShapes(request), frames)
 }
 
-/// The same for a collection that is there.
+/// The same for an existing collection.
 pub(crate) fn additions(
     collection: &str,
     shapes: &[(&str, &str)],
@@ -276,7 +277,8 @@ pub(crate) fn additions(
     (request, frames.collect())
 }
 
-/// A closed surface of 2 × 16 × 23 triangles like a skittle: a body and a head, of varying proportions.
+/// A closed surface of 2 × 16 × 23 triangles shaped like a skittle: a body and a head, with varying
+/// proportions.
 pub(crate) fn skittle(variant: u32) -> String {
     let (rings, sectors) = (24_u32, 16_u32);
     let mut vertices = vec![[0.0, 0.0, -1.0]];
@@ -317,7 +319,7 @@ pub(crate) fn skittle(variant: u32) -> String {
 /// Faces of a [`skittle`].
 pub(crate) const SKITTLE_FACES: usize = 2 * 16 * 23;
 
-/// Waits until a collection has nothing left to do.
+/// Waits until a collection has no work left.
 pub(crate) fn wait_idle(client: &mut Client, collection: &str) {
     let request = wire::WaitIdleRequest {
         collection: collection.to_owned(),
@@ -337,7 +339,7 @@ pub(crate) fn number(variable: &str, default: u64) -> u64 {
     })
 }
 
-/// The seed of random tests: always the same, unless the environment names another.
+/// The seed of random tests: constant, unless the environment sets another.
 pub(crate) fn seed() -> u64 {
     number("COSEG_TEST_SEED", 1)
 }
@@ -360,7 +362,7 @@ pub(crate) fn exists(path: impl AsRef<Path>) -> bool {
     path.as_ref().exists()
 }
 
-/// The messy meshes of the benchmark data, by path; `None`, and a notice, where there is none.
+/// The messy meshes of the benchmark data, by path; `None`, with a notice, if they are missing.
 pub(crate) fn messy_files() -> Option<Vec<PathBuf>> {
     fn files(folder: &Path, into: &mut Vec<PathBuf>) {
         for entry in std::fs::read_dir(folder).unwrap() {

@@ -1,5 +1,5 @@
-//! Meshes that have hurt others, made here: each is refused with a reason or served, by the parsers, by a
-//! description, and through the socket.
+//! Tests meshes that have crashed other programs, generated here: each is refused with a reason or
+//! served, by the parsers, by a description, and through the socket.
 
 use crate::harness::{Home, number, seed, skittle};
 use bytes::Bytes;
@@ -19,7 +19,7 @@ pub(crate) struct Hostile {
     pub(crate) bytes: Vec<u8>,
 }
 
-/// A tetrahedron as OBJ and as OFF, to be spoilt.
+/// A tetrahedron as OBJ and as OFF, for damaging.
 const OBJ: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n";
 const OFF: &str = "OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
 
@@ -222,8 +222,8 @@ pub(crate) fn corpus() -> Vec<Hostile> {
         let _ = writeln!(text, "{n} {}", corners.join(" "));
         off(&format!("a polygon that is {name}"), text);
     };
-    // As many corners as are read, in the orders that are the slowest for some way of
-    // triangulating.
+    // The maximum number of corners, in the orders that are slowest for some method of
+    // triangulation.
     let circle = |i: usize, radius: f64| {
         let a = i as f64 * 6.283_185e-4;
         [radius * a.cos(), radius * a.sin()]
@@ -233,7 +233,7 @@ pub(crate) fn corpus() -> Vec<Hostile> {
     flat("a star", &corners.clone().map(star).collect::<Vec<_>>());
     let knot = |i| circle(i * 7919 % 10_000, 1.0);
     flat("a knot", &corners.clone().map(knot).collect::<Vec<_>>());
-    // Teeth of all lengths cross nearly all edges of the triangulation: the square of their number.
+    // Teeth of all lengths cross nearly all edges of the triangulation, hence quadratically many.
     let comb = |i: usize| {
         [
             i as f64,
@@ -310,7 +310,7 @@ pub(crate) fn corpus() -> Vec<Hostile> {
         "a line of 4 MB",
         format!("{OBJ}f {}\n", "1 ".repeat(2 << 20)),
     );
-    // Cut at every offset, and bytes that say nothing.
+    // Files cut at every offset, and meaningless bytes.
     for (format, text) in [(Format::Obj, OBJ), (Format::Off, OFF)] {
         for end in (0..text.len()).step_by(3) {
             put(
@@ -374,7 +374,7 @@ fn the_corpus_is_parsed_or_refused_without_a_panic() {
     }
 }
 
-/// Bytes of the corpus spoilt at random; longer with `COSEG_TEST_MUTATIONS`.
+/// Bytes of the corpus, damaged at random; `COSEG_TEST_MUTATIONS` makes the test longer.
 #[test]
 fn spoilt_meshes_and_requests_do_not_panic() {
     use prost::Message as _;
@@ -457,9 +457,9 @@ fn the_corpus_through_the_socket_leaves_the_daemon_as_it_was() {
     let before = resident(client);
     let (mut n_refused, mut n_served, mut largest) = (0, 0, 0);
     let corpus = corpus();
-    // One request for each, as clients would, and so that one that is refused shows by itself.
+    // One request for each, like a client, so that each refusal is seen separately.
     for hostile in &corpus {
-        // Cleaning and describing these at length is tested elsewhere.
+        // Cleaning and describing these in detail is tested elsewhere.
         if hostile.name.starts_with("cut at") && !hostile.name.contains('7') {
             continue;
         }
@@ -489,7 +489,7 @@ fn the_corpus_through_the_socket_leaves_the_daemon_as_it_was() {
             ItemState::Done => n_served += 1,
             ItemState::Failed => {
                 let e = item.error.unwrap();
-                // A worker that ended would be a bug in the parsers or in the numerics.
+                // A worker that ends would show a bug in the parsers or in the numerics.
                 let why = format!("{}: {:?} {}", hostile.name, e.reason(), e.message);
                 assert!(e.message.len() < 4_096, "{why:.300}");
                 assert!(

@@ -1,5 +1,5 @@
-//! All integration tests in one binary: linking dominates on two cores.
-// Clippy sees tests, not what they share.
+//! Holds all integration tests in one binary, because linking dominates on two cores.
+// Clippy recognises tests, but not their shared functions.
 #![allow(clippy::unwrap_used)]
 
 mod cli;

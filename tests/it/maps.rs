@@ -1,4 +1,5 @@
-//! Maps between points: against pyFM (pyfmaps 1.3.1) on its own pair of meshes, and through the library.
+//! Compares maps between points with pyFM (pyfmaps 1.3.1) on its own pair of meshes, and tests them
+//! through the library.
 
 mod kept;
 mod npz;
@@ -16,7 +17,7 @@ use coseg::synth::{Family, family};
 use nalgebra::{DMatrix, DVector};
 use std::path::{Path, PathBuf};
 
-/// Where pyFM's pair and reference arrays are: beside the benchmark meshes.
+/// The folder of pyFM's pair and reference arrays: beside the benchmark meshes.
 fn peers() -> Option<PathBuf> {
     let data = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from)?;
     let peers = data.join("../peers");
@@ -54,7 +55,7 @@ impl Meshed {
         }
     }
 
-    /// As pyFM computed it.
+    /// The results of pyFM.
     fn of_pyfm(path: &Path) -> Self {
         let single = |name: &str| -> Vec<f32> {
             let array = npz::read(path, name);
@@ -77,7 +78,8 @@ impl Meshed {
     }
 }
 
-/// Vertices of 5,000 that may differ: pyFM searches in double precision, and near ties go either way.
+/// Number of vertices, of 5,000, that may differ: pyFM searches in double precision, and near ties
+/// may go either way.
 const MAX_OTHER: usize = 50;
 
 #[test]
@@ -89,7 +91,7 @@ fn zoomout_from_the_same_map_is_that_of_pyfm() {
     let reference = peers.join("ref/cat_lion.npz");
     let array = |name: &str| npz::read(&reference, name);
     let truth: Vec<u32> = array("gt_p2p21").values.iter().map(|x| *x as u32).collect();
-    // Eigenvectors have signs of their own, so entries agree in magnitude.
+    // Signs of eigenvectors are arbitrary, so entries agree in magnitude.
     let cat = Meshed::new(&peers.join("meshes/cat-00.off"), 20);
     let lion = Meshed::new(&peers.join("meshes/lion-00.off"), 20);
     let c = functional(&cat.basis(), &lion.basis(), &truth, 20, 20);
@@ -120,7 +122,7 @@ fn zoomout_from_the_same_map_is_that_of_pyfm() {
     assert!(other <= MAX_OTHER, "{other} of {} vertices", theirs.len());
 }
 
-/// pyFM's normalisation of the four terms (`canonical_taus`), so that its energy is ours.
+/// pyFM's normalisation of the four terms (`canonical_taus`), so that the energies are equal.
 struct Weights {
     probes: f64,
     mask: f64,
@@ -134,8 +136,8 @@ fn p_effective(f: &DMatrix<f64>) -> f64 {
     gram.trace().powi(2) / gram.norm_squared()
 }
 
-/// On its basis and descriptors and by its energy, no map of pyFM's is better than ours. Needs the arrays that a
-/// full run of its script writes: COSEG_TEST_PEERS names their folder.
+/// On its basis and descriptors and by its energy, no map of pyFM is better than ours. Needs the
+/// arrays of a full run of its script: COSEG_TEST_PEERS names their folder.
 #[test]
 fn no_map_of_pyfm_has_less_energy() {
     let (Some(peers), Some(full)) = (
@@ -236,7 +238,8 @@ fn no_map_of_pyfm_has_less_energy() {
         let (a, b) = (energy.value(&ours), energy.value(&theirs));
         println!("{name}: energy {a:.9} against {b:.9}");
         assert!(a <= b * (1.0 + 1e-6), "{name}: {a} against {b}");
-        // The same energy: theirs is a minimum of it too, up to where their search stopped.
+        // The energy is the same: their map is a minimum of it too, up to the tolerance of their
+        // search.
         assert!(b < a * 1.02 + 1e-9, "{name}: {a} against {b}");
     }
 }

@@ -1,6 +1,7 @@
-//! Libraries as earlier versions left them: kept in the repository, opened, read, brought up to date, gone on with.
+//! Tests libraries of earlier versions, which are in the repository: they are opened, read,
+//! upgraded, and extended.
 //!
-//! `tests/fixtures/make.sh` says how they were made.
+//! `tests/fixtures/make.sh` describes how they were made.
 
 use coseg::Library;
 use coseg::library::NewShape;
@@ -50,7 +51,7 @@ fn format_of(library: &Path) -> u32 {
         .unwrap()
 }
 
-/// What everything that can be asked of a shape answers, as text.
+/// The answers to all requests for a shape, as text.
 fn answers(library: &Library) -> String {
     let mut text = String::new();
     for shape in ["a", "b", "c"] {
@@ -83,7 +84,7 @@ fn an_old_library_opens_is_read_and_goes_on() {
         let expected = fixture(format).with_extension("txt");
         let expected = std::fs::read_to_string(expected).unwrap();
         assert_eq!(answers(&library), expected, "format {format}");
-        // What this version adds works on it.
+        // Features of this version work on it.
         library.name_label("boxes", 0, "side", None).unwrap();
         library.undo("boxes", None).unwrap();
         let shape = NewShape {
@@ -118,7 +119,8 @@ fn a_library_of_a_later_version_is_refused_and_left_as_it_is() {
     assert_eq!(std::fs::read(path.join("catalog.db")).unwrap(), before);
 }
 
-/// Makes the fixture of the present format in the folder that `COSEG_TEST_FIXTURE` names; see `tests/fixtures/make.sh`.
+/// Writes the fixture of the present format to the folder in `COSEG_TEST_FIXTURE`; see
+/// `tests/fixtures/make.sh`.
 #[test]
 #[ignore = "writes a fixture"]
 fn make_fixture() {
@@ -143,7 +145,7 @@ fn make_fixture() {
     }
     std::fs::write(path.with_extension("txt"), answers(&library)).unwrap();
     drop(library);
-    // All of it in one file.
+    // Everything is in one file.
     rusqlite::Connection::open(path.join("catalog.db"))
         .unwrap()
         .execute_batch("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -1,4 +1,5 @@
-//! The whole job in process: streams of shapes, their labels, and the rules by which labels change.
+//! Tests the whole pipeline in process: streams of shapes, their labels, and the rules for changes
+//! of labels.
 
 use coseg::Library;
 use coseg::labels::score::{Score, ScoredShape, score};
@@ -95,14 +96,14 @@ fn a_stream_of_pliers_is_labelled_consistently() {
     assert_eq!(score.n_missing, 0);
 }
 
-/// As long as every clustering is taken, what is found follows from the shapes alone.
+/// As long as every clustering is accepted, the discovered labels depend on the shapes alone.
 #[test]
 fn the_order_of_arrival_makes_no_difference_to_what_is_found() {
     let shapes = family(Family::Pliers, 5, 5, &SMALL);
     let parts = |shapes: &[Labelled]| {
         let (_folder, library) = library(3, Up::Unknown);
         stream(&library, shapes);
-        // Label ids go by the history: numbered as they first occur, they do not.
+        // Label ids depend on the history; numbered by first occurrence, they do not.
         let mut numbers = BTreeMap::new();
         let mut numbered = |label: &i32| {
             let next = numbers.len();
@@ -430,8 +431,8 @@ fn a_description_follows_the_surface_and_not_its_frame() {
     assert_eq!(a.face_map.len(), b.face_map.len());
 }
 
-/// Benchmark categories, where `COSEG_TEST_DATA` names them: (category, parts, least accuracy). The bounds are far
-/// below what is measured and far above one constant label.
+/// Benchmark categories in the folder in `COSEG_TEST_DATA`: (category, parts, least accuracy). The
+/// bounds are far below the measured accuracy and far above that of one constant label.
 #[test]
 fn benchmark_categories_reach_their_floors() {
     let Some(data) = std::env::var_os("COSEG_TEST_DATA").map(PathBuf::from) else {

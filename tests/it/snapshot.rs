@@ -1,4 +1,4 @@
-//! Snapshots while shapes come in, restoring, and repairing what is damaged.
+//! Tests snapshots while shapes are added, restoring, and repairs of damage.
 
 use crate::harness::{Home, add, add_request, coseg, json, skittle};
 use coseg::call;
@@ -33,7 +33,7 @@ fn a_snapshot_while_shapes_come_in_restores_to_the_byte() {
     client.call(body, frames).unwrap();
     let library = home.path("library").display().to_string();
     let at = |name: &str| home.path(name).display().to_string();
-    // Several, one after the other, while the daemon commits.
+    // Several snapshots, one after the other, while the daemon commits.
     for i in 0..4 {
         let copy = at(&format!("copy{i}"));
         let link = if i == 3 { "--link" } else { "--json" };
@@ -46,7 +46,7 @@ fn a_snapshot_while_shapes_come_in_restores_to_the_byte() {
         assert!(!Path::new(&format!("{copy}.partial")).exists());
     }
     super::harness::wait_idle(client, "c");
-    // What the newest one holds is what the library holds under these versions.
+    // The newest snapshot equals the library at these versions.
     let other = Home::new();
     let restored = other.path("library").display().to_string();
     let out = run(&["restore", &at("copy3"), "--library", &restored]);
@@ -57,7 +57,7 @@ fn a_snapshot_while_shapes_come_in_restores_to_the_byte() {
     );
     let again = run(&["restore", &at("copy3"), "--library", &restored]);
     assert_eq!(again.status.code(), Some(1), "a library is not overwritten");
-    // Restored, its queued shapes are placed as in the library itself.
+    // After restoring, its queued shapes are placed as in the library itself.
     let copy = other.start();
     let twin = &mut copy.client();
     super::harness::wait_idle(twin, "c");
@@ -126,7 +126,7 @@ fn what_can_be_computed_again_is_repaired_and_the_rest_is_named() {
     };
     assert_eq!(findings(&check(&[], 0)), [""; 0]);
 
-    // The description of one, the signature of another, a map, and an index.
+    // The damage: the description of one shape, the signature of another, a map, and an index.
     let whole = damaged(&library, "objects");
     let whole_name = whole.strip_prefix(&library).unwrap().display().to_string();
     let connection = rusqlite::Connection::open(library.join("catalog.db")).unwrap();
@@ -157,7 +157,7 @@ fn what_can_be_computed_again_is_repaired_and_the_rest_is_named() {
         1
     );
 
-    // The bytes that were sent cannot be computed: named, and all else is served.
+    // The original bytes cannot be recomputed: they are reported, and everything else is served.
     let original = damaged(&library, "originals");
     let original = original
         .strip_prefix(&library)
@@ -209,7 +209,7 @@ fn what_a_killed_copy_left_is_taken_over_and_nothing_else() {
     std::fs::create_dir_all(partial.join("objects/ab")).unwrap();
     std::fs::write(partial.join("objects/ab/half"), "half").unwrap();
     std::fs::write(partial.join("catalog.db"), "half").unwrap();
-    // Somebody is still at it.
+    // Another copy is still running.
     let other = std::fs::File::open(&partial).unwrap();
     rustix::fs::flock(&other, rustix::fs::FlockOperation::LockExclusive).unwrap();
     let refused = snapshot();
@@ -217,20 +217,23 @@ fn what_a_killed_copy_left_is_taken_over_and_nothing_else() {
     assert_eq!(refused.status.code(), Some(1), "{said}");
     assert!(said.contains("another process is writing"), "{said}");
     drop(other);
-    // It holds what no copy leaves.
+    // It contains files that no copy leaves.
     let mine = partial.join("mine.txt");
     std::fs::write(&mine, "mine").unwrap();
     let refused = snapshot();
     let said = String::from_utf8_lossy(&refused.stderr).into_owned();
     assert_eq!(refused.status.code(), Some(1), "{said}");
-    assert!(said.contains("holds what no copy leaves"), "{said}");
+    assert!(
+        said.contains("contains files that no copy leaves"),
+        "{said}"
+    );
     assert!(partial.join("objects/ab/half").exists());
     std::fs::remove_file(mine).unwrap();
     let done = snapshot();
     let said = String::from_utf8_lossy(&done.stderr).into_owned();
     assert!(done.status.success(), "{said}");
     assert!(!partial.exists() && !copy.join("objects/ab/half").exists());
-    // A folder that a stranger has made a link of is not written through.
+    // A folder that another user has replaced by a link is not written through.
     let elsewhere = home.path("elsewhere");
     std::fs::create_dir(&elsewhere).unwrap();
     std::os::unix::fs::symlink(&elsewhere, home.path("linked.partial")).unwrap();

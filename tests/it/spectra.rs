@@ -1,5 +1,5 @@
-//! Spectra from outside: against another implementation, against formulas, on dirty meshes, and through
-//! the command.
+//! Compares spectra with another implementation and with formulas, and tests them on dirty meshes
+//! and through the command.
 
 mod command;
 mod convergence;
@@ -10,7 +10,7 @@ use coseg::operators::{Laplacian, Operator, laplacian};
 use coseg::spectrum::{Options, Progress, Spectrum, SpectrumError};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// What the solver promises.
+/// The bound that the solver promises.
 const RESIDUAL: f64 = 1e-8;
 const ORTHONORMAL: f64 = 1e-10;
 
@@ -25,7 +25,7 @@ fn smallest(operator: &Laplacian, k: usize) -> Result<Spectrum, SpectrumError> {
     Ok(found)
 }
 
-/// The promises that hold for any matrix: `columns` are the eigenvectors.
+/// Checks the promises that hold for any matrix: `columns` are the eigenvectors.
 fn check(operator: &Laplacian, eigenvalues: &[f64], columns: &[Vec<f64>]) {
     let mass = &operator.mass;
     assert_eq!(columns.len(), eigenvalues.len());
@@ -68,7 +68,7 @@ fn another_thread_stops_a_solve() {
         });
         let hook = |p: &Progress| {
             begun.fetch_or(p.done > 0, Ordering::AcqRel);
-            // Never beyond half of the space, so that it is the flag that ends it.
+            // The count stays below half of the space, so that the flag ends the solve.
             while 2 * p.done > p.expected && !stop.load(Ordering::Acquire) {
                 std::thread::yield_now();
             }

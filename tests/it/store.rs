@@ -1,4 +1,4 @@
-//! The store through its public interface: round trips, faults, crashes, damage.
+//! Tests the store through its public interface: round trips, faults, crashes, damage.
 
 mod array_files;
 mod catalog;
@@ -103,7 +103,7 @@ fn summary(label_epoch: u64, labels: &[u32]) -> LabelSummary {
     }
 }
 
-/// Commits one shape the way a library does: objects, then everything else in one transaction.
+/// Commits one shape like a library: objects, then everything else in one transaction.
 fn add_shape(
     store: &Store,
     collection: &str,
@@ -195,7 +195,7 @@ fn add_shape(
     })
 }
 
-/// The row of a collection that must be there.
+/// The row of a collection that must exist.
 fn collection_id(store: &Store, name: &str) -> CollectionId {
     let row = store
         .catalog()
@@ -209,7 +209,7 @@ trait Distinct {
 }
 
 impl Distinct for LabelSummary {
-    /// A shape carries each label once.
+    /// A shape has each label once.
     fn distinct(mut self) -> Self {
         self.area_shares.dedup_by_key(|share| share.0);
         self

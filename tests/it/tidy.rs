@@ -1,5 +1,5 @@
-//! What the layout and the documents promise and the compiler does not check. Every check is itself
-//! checked on planted faults.
+//! Checks promises of the layout and the documents that the compiler does not check. Every check is
+//! itself tested with planted faults.
 
 mod code;
 mod docs;
@@ -69,7 +69,7 @@ fn the_code_keeps_to_the_layout() {
 
 #[test]
 fn the_order_of_modules_is_complete() {
-    // Of the binary alone; no module of the library can name them.
+    // Modules of the binary only; no module of the library can name them.
     let binary = ["main", "cli", "commands", "telemetry", "lib"];
     for sources in CRATES {
         let mut modules = Vec::new();
@@ -110,7 +110,7 @@ fn links_lead_somewhere() {
     assert_none(&faults);
 }
 
-/// What the README says of accuracy is what was measured, and of the demonstration what it does.
+/// Figures of accuracy in the README equal the measured ones, and its demonstration exists.
 #[test]
 fn figures_of_the_readme_are_those_of_the_pages() {
     let read = |name: &str| fs::read_to_string(root().join(name)).unwrap();
@@ -123,7 +123,7 @@ fn figures_of_the_readme_are_those_of_the_pages() {
     ));
 }
 
-/// A package holds its own folder only, so each has the texts beside it.
+/// A package contains only its own folder, so each package has the licences beside it.
 #[test]
 fn every_package_has_the_licence() {
     for text in ["LICENSE-MIT", "LICENSE-APACHE"] {
@@ -144,7 +144,7 @@ fn every_package_has_the_licence() {
     }
 }
 
-/// What the README says to type is what the program takes.
+/// Commands in the README exist.
 #[test]
 fn commands_of_the_readme_exist() {
     let readme = fs::read_to_string(root().join("README.md")).unwrap();

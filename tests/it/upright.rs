@@ -1,12 +1,13 @@
-//! The up axis of a collection: shapes that stand along another one are noticed, and a person changes it.
+//! Tests the up axis of a collection: shapes that stand along another one are noticed, and a person
+//! can change it.
 
 use crate::pipeline::{COLLECTION, SMALL, accuracy, all_labels, file, library, stream};
 use coseg::Library;
 use coseg::library::{Correction, EventKind, LibraryError, RequestKey, Up, UpSet};
 use coseg::synth::{Family, Labelled, family};
 
-/// By how much a collection whose axis was corrected may be worse than one that had it from the start: the latter was
-/// clustered at other sizes.
+/// The largest disadvantage of a collection with a corrected axis, compared with one that had it
+/// from the start, which was clustered at other sizes.
 const SLACK: f64 = 0.03;
 
 fn chairs(n: u32) -> Vec<Labelled> {
@@ -72,7 +73,7 @@ fn another_axis_clusters_again_and_is_undone_to_the_byte() {
     let labelled = all_labels(&library);
     assert_ne!(labelled, before);
 
-    // What comes later is labelled along the new axis, also after the library was closed.
+    // Later shapes are labelled along the new axis, also after the library was closed.
     drop(library);
     let library = Library::open(folder.path()).unwrap();
     assert_eq!(all_labels(&library), labelled);
@@ -130,7 +131,7 @@ fn labels_stay_where_the_axis_in_force_does() {
     stream(&library, &shapes);
     let before = all_labels(&library);
     let info = library.collection(COLLECTION).unwrap();
-    // The estimate is the axis that was given.
+    // The estimate is the given axis.
     assert!(set(&library, Up::Auto).changed);
     let after = library.collection(COLLECTION).unwrap();
     assert_eq!(after.up_estimate.unwrap().up, Up::PlusY);
@@ -151,7 +152,7 @@ fn an_empty_collection_begins_along_the_new_axis() {
     assert_eq!((done.changed, done.n_stale), (true, 0));
     stream(&library, &shapes);
     assert_eq!(all_labels(&library), all_labels(&fresh));
-    // Emptied, it begins again.
+    // An emptied collection starts again.
     for s in &shapes {
         library.remove(COLLECTION, &s.name, None).unwrap();
     }
@@ -194,7 +195,7 @@ fn what_a_person_labelled_stays_and_the_rest_follows() {
     // Along the wrong axis: 0.625.
     let found = accuracy(&library, &shapes).accuracy;
     assert!(found > wrong, "{found:.3}, along the wrong axis {wrong:.3}");
-    // A shape that comes now has the person's labels too.
+    // A shape that is added now has the person's labels too.
     let late = &chairs(6)[5];
     library
         .add(COLLECTION, file(&late.name, &late.mesh))

@@ -1,4 +1,4 @@
-//! The HTTP endpoint, and the commands that show: `view`, `top`, completions and manual page.
+//! Tests the HTTP endpoint, and the commands `view`, `top`, completions and manual page.
 
 use crate::harness::{Daemon, Home, add, coseg, json, skittle, stdout};
 use std::io::{Read as _, Write as _};
@@ -78,7 +78,8 @@ fn health_and_metrics_are_told() {
             "docs/metrics.md does not have {name}"
         );
     }
-    // What the documents name is exposed; two families have no member while nothing is in work or refused.
+    // The documented metrics exist; two families have no member while no work runs and nothing was
+    // refused.
     const MAY_BE_EMPTY: [&str; 2] = ["coseg_shapes_at_stage", "coseg_requests_refused_total"];
     let is_name = |c: char| c.is_alphanumeric() || c == '_';
     let operations = include_str!("../../docs/operations.md");
@@ -140,7 +141,7 @@ fn only_the_page_itself_may_change_anything() {
     assert!(shown()["labels"][0]["name"].is_null());
     assert_eq!(name(&own).0, 200);
     assert_eq!(shown()["labels"][0]["name"], "body");
-    // What the daemon refuses has its reason.
+    // A refusal of the daemon has its reason.
     let wrong = r#"{"collection":"skittles","label":99,"name":"x"}"#;
     let (status, _, body) = exchange(address, "POST /api/name", &own, wrong);
     let body: serde_json::Value = serde_json::from_slice(&body).unwrap();
@@ -151,7 +152,7 @@ fn only_the_page_itself_may_change_anything() {
     assert_eq!(exchange(address, "POST /api/name", &own, "{").0, 400);
     assert_eq!(exchange(address, "POST /api/drain", &own, "{}").0, 404);
     assert_eq!(exchange(address, "DELETE /", &host, "").0, 405);
-    // A page of another site that was made to point here sees nothing, and has nothing computed.
+    // A page of another site that redirects here sees nothing, and triggers no computation.
     let status = |path: &str, headers: &str| exchange(address, path, headers, "").0;
     for host in ["example.org", "[::1].evil.example", "localhost:evil"] {
         let headers = format!("host: {host}\r\n");
@@ -162,7 +163,7 @@ fn only_the_page_itself_may_change_anything() {
                 "{path} {host}"
             );
         }
-        // A probe may call it what it likes.
+        // A probe may use any host name.
         assert_eq!(status("GET /healthz", &headers), 200);
         assert_eq!(status("GET /readyz", &headers), 200);
     }
@@ -393,7 +394,7 @@ fn beyond_this_machine_a_token_opens_what_there_is() {
     let (status, _, said) = ask("/api/library", &cookie);
     assert!(status == 200 && said.contains("skittles"), "{said}");
     assert!(ask("/", &cookie).2.contains("viewer.js"));
-    // Who has the cookie is asked for what a change needs, as on loopback.
+    // A client with the cookie still needs the header for a change, as on loopback.
     let name = |headers: &str| {
         let body = r#"{"collection":"skittles","label":0,"name":"body"}"#;
         exchange(address, "POST /api/name", &format!("{host}{headers}"), body).0
@@ -405,7 +406,7 @@ fn beyond_this_machine_a_token_opens_what_there_is() {
     assert_eq!(name(&foreign), 403);
     assert_eq!(name(&format!("{cookie}{change}")), 200);
     drop(daemon);
-    // The same token after a restart; monitoring without one, where that is set.
+    // The same token works after a restart; monitoring needs none if so configured.
     let (_daemon, address) = start(&[("COSEG__HTTP__OPEN_MONITORING", "true")]);
     for path in ["/healthz", "/readyz", "/metrics"] {
         assert_eq!(get(address, path).0, 200, "{path}");

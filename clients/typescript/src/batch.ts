@@ -1,4 +1,4 @@
-/** A stream of meshes becomes requests of bounded size, whose ids name their contents. */
+/** Cuts a stream of meshes into requests of bounded size, whose ids identify their contents. */
 
 import { createHash } from "node:crypto";
 import { basename, extname } from "node:path";
@@ -10,11 +10,17 @@ import { AddMode, AddShapesRequestSchema, type AddShapesRequest, type ShapeInput
 import { beyond } from "./size.js";
 import { FrameWriter, shapeInput, type Mesh } from "./wire.js";
 
-/** Shapes and bytes of one request: small enough that the first is at work while the next is read. */
+/**
+ * Shapes and bytes of one request: small enough that the daemon works on the first while the next
+ * is read.
+ */
 const BATCH_SHAPES = 16;
 const BATCH_BYTES = 16 << 20;
 
-/** What `addMany` takes: a path, named after its stem, or a name and a mesh. */
+/**
+ * An input of `addMany`: a path, whose file name without extension becomes the shape's name, or a
+ * name and a mesh.
+ */
 export type Item = string | readonly [name: string, mesh: Mesh];
 
 /** A shape that could not be sent. */
@@ -23,15 +29,15 @@ export interface Unsent {
   readonly error: Error;
 }
 
-/** Shapes of one request, and those between them that could not even be sent. */
+/** Shapes of one request, and the shapes between them that could not be sent. */
 export class Batch {
   readonly writer = new FrameWriter();
-  /** In order: a shape that was not sent, or undefined for the next one of the request. */
+  /** In order: a shape that was not sent, or undefined for the next shape of the request. */
   readonly results: (Unsent | undefined)[] = [];
 
   constructor(readonly request: AddShapesRequest) {}
 
-  /** The same for the same shapes at the same place, whoever sends them. */
+  /** Equal for equal shapes at the same position, for any sender. */
   requestId(index: number): string {
     const digest = createHash("sha256").update(toBinary(AddShapesRequestSchema, this.request));
     for (const frame of this.writer.frames) digest.update(`${frame.length},`).update(frame);
@@ -49,7 +55,7 @@ export async function* batches(
   spec: CollectionSpec,
 ): AsyncGenerator<Batch> {
   if (!(inFlight >= 1)) throw new RangeError(`inFlight is ${inFlight}, expected at least 1`);
-  // A batch that the whole queue cannot hold would be refused for ever.
+  // The daemon would always refuse a batch that exceeds its whole queue.
   const bounds = [BATCH_SHAPES, inFlight >> 2, limits.maxShapesPerRequest, Number(limits.maxQueuedShapes)];
   const nShapes = Math.max(1, Math.min(...bounds));
   const maxMessage = Number(limits.maxMessageBytes);

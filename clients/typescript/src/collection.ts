@@ -38,11 +38,11 @@ import type {
 } from "./types.js";
 import { FrameWriter, formatName, plain, type Encoded, type Matrix, type Mesh } from "./wire.js";
 
-/** Silence after which a subscription is made anew; heartbeats come once a second. */
+/** Silence after which the client subscribes again; heartbeats come once a second. */
 const SILENCE_MS = 3_000;
 const HEARTBEAT_TOPIC = "\0";
 
-/** One collection of a library; made by {@link Library.collection}. */
+/** One collection of a library; created by {@link Library.collection}. */
 export class Collection {
   /** @internal */
   constructor(
@@ -51,7 +51,7 @@ export class Collection {
     readonly spec: CollectionSpec,
   ) {}
 
-  /** As it stands, with its labels. */
+  /** Returns its present state, with its labels. */
   async info(): Promise<CollectionInfo> {
     const [{ collection }] = await this.library.call("describeCollection", { collection: this.name });
     if (collection === undefined) throw new BadReply("a described collection is missing");
@@ -59,8 +59,8 @@ export class Collection {
   }
 
   /**
-   * Changes which way is up: labels are found again along the new axis, and faces that were labelled by hand keep
-   * theirs. Shapes that are left to do follow in the background: {@link waitIdle}. Can be undone.
+   * Changes the up axis: shapes are labelled again along the new axis, and faces labelled by hand
+   * keep their labels. Other shapes follow in the background: {@link waitIdle}. Can be undone.
    */
   async set(settings: { readonly up: NonNullable<Settings["up"]> }): Promise<Updated> {
     const request = { collection: this.name, up: up(settings.up) };
@@ -72,7 +72,7 @@ export class Collection {
     await this.library.call("deleteCollection", { collection: this.name });
   }
 
-  /** Adds a shape and waits until it is labelled. A refusal is thrown. */
+  /** Adds a shape and waits until it is labelled. Throws if the daemon refuses it. */
   async add(name: string, mesh: Mesh, options: { replace?: boolean } = {}): Promise<Added> {
     for await (const added of this.addMany([[name, mesh]], options)) {
       if (added.error) throw added.error;
@@ -81,7 +81,9 @@ export class Collection {
     throw new BadReply("a finished job without its shape");
   }
 
-  /** Hands shapes over and returns the ids of their jobs as soon as the daemon has them durably. */
+  /**
+   * Submits shapes and returns the ids of their jobs as soon as the daemon has stored them durably.
+   */
   async submit(
     shapes: Iterable<Item> | AsyncIterable<Item>,
     options: { replace?: boolean; key?: string } = {},
@@ -96,11 +98,13 @@ export class Collection {
   }
 
   /**
-   * Streams shapes in, and yields what became of each, in order. `shapes` is read as needed, and at most
-   * about `inFlight` (64) are under way. One that fails is yielded with its `error`; the others go on.
+   * Streams shapes to the daemon, and yields the result of each, in order. `shapes` is read as
+   * needed; at most about `inFlight` (64) shapes are in flight. A shape that fails is yielded with
+   * its `error`; the others continue.
    *
-   * A daemon that is restarted gets the same requests again. If *this* program may die and be run again,
-   * give the run a `key`: with the same key and shapes a second run takes up the jobs of the first.
+   * A daemon that restarts gets the same requests again. If *this* program may be interrupted and
+   * run again, give the run a `key`: with the same key and shapes a second run resumes the jobs of
+   * the first.
    */
   async *addMany(
     shapes: Iterable<Item> | AsyncIterable<Item>,
@@ -136,7 +140,7 @@ export class Collection {
         const { frames } = batch.writer;
         const requestId = batch.requestId(index);
         [{ jobId }] = await this.library.call("addShapes", batch.request, { frames, clientId, requestId });
-        // The bytes are the daemon's now.
+        // The daemon has the bytes now, so they can be freed.
         frames.length = 0;
       }
       index += 1;
@@ -164,7 +168,10 @@ export class Collection {
     }
   }
 
-  /** Waits until no shape is to be placed and no label to be recomputed, at most `timeout` seconds. */
+  /**
+   * Waits until no shape waits to be placed and no label to be recomputed, at most `timeout`
+   * seconds.
+   */
   async waitIdle(timeout = Infinity): Promise<Idle> {
     for (let leftMs = timeout * 1000; ; ) {
       const waitMs = Math.trunc(Math.min(WAIT_MS, Math.max(0, leftMs)));
@@ -176,7 +183,7 @@ export class Collection {
     }
   }
 
-  /** All shapes in the order of their arrival, or those that carry a label. */
+  /** All shapes in the order of their arrival, or those that have a label. */
   async *shapes(options: { label?: number | string } = {}): AsyncGenerator<Shape> {
     const wish = options.label === undefined ? {} : { label: await this.#label(options.label) };
     let pageToken = "";
@@ -187,7 +194,7 @@ export class Collection {
     } while (pageToken !== "");
   }
 
-  /** One shape: its parts, what cleaning found, where its labels come from. */
+  /** One shape: its parts, the findings of cleaning, and the sources of its labels. */
   async shape(name: string): Promise<Shape> {
     const [{ shape }] = await this.library.call("getShape", { collection: this.name, shape: name });
     if (shape === undefined) throw new BadReply("the shape is missing");
@@ -199,7 +206,7 @@ export class Collection {
     return (await this.labelling(name, options)).labels;
   }
 
-  /** Labels with their version and, if wanted, their probabilities. */
+  /** Labels with their version and, optionally, their probabilities. */
   async labelling(name: string, options: { version?: number; confidence?: boolean } = {}): Promise<Labelling> {
     const { version = 0, confidence = false } = options;
     const request = { collection: this.name, shape: name, version: BigInt(version), confidence };
@@ -209,7 +216,10 @@ export class Collection {
     return { version: Number(reply.version), labels, ...probabilities };
   }
 
-  /** The labels of all shapes as of one moment; `events({ since: snapshot.sequence })` goes on. */
+  /**
+   * The labels of all shapes at one moment; `events({ since: snapshot.sequence })` continues from
+   * it.
+   */
   async snapshot(): Promise<Snapshot> {
     const [reply, raw] = await this.library.call("labelsSnapshot", { collection: this.name });
     const shapes = reply.shapes.map((s): [string, Labelling] => {
@@ -218,7 +228,7 @@ export class Collection {
     return { sequence: Number(reply.sequence), shapes: new Map(shapes) };
   }
 
-  /** The bytes of a shape as they were sent; of arrays, an OFF file with the same values. */
+  /** The bytes of a shape in their original form; for arrays, an OFF file with the same values. */
   async original(name: string): Promise<Encoded> {
     const [reply, raw] = await this.library.call("getOriginal", { collection: this.name, shape: name });
     return { format: formatName(reply.format), data: raw.file(reply.bytes) };
@@ -229,7 +239,9 @@ export class Collection {
     await this.library.call("removeShape", { collection: this.name, shape: name });
   }
 
-  /** At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes. */
+  /**
+   * At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes.
+   */
   async portraits(
     names: readonly string[],
     detail: "proxy" | "surface" | "functions" = "proxy",
@@ -240,7 +252,7 @@ export class Collection {
     return raw.file(reply.pack);
   }
 
-  /** Eigenvalues and, if wanted, eigenvectors and mass. */
+  /** Eigenvalues and, optionally, eigenvectors and mass. */
   async spectrum(name: string, options: { eigenvectors?: boolean } = {}): Promise<Spectrum> {
     const { eigenvectors = false } = options;
     const request = { collection: this.name, shape: name, eigenvectors };
@@ -259,7 +271,7 @@ export class Collection {
     return raw.array(Float32Array, reply.hks);
   }
 
-  /** The working mesh and what the segmentation is computed from. */
+  /** The working mesh and the data from which the segmentation is computed. */
   async descriptors(name: string): Promise<Descriptors> {
     const [reply, raw] = await this.library.call("getDescriptors", { collection: this.name, shape: name });
     return {
@@ -274,8 +286,9 @@ export class Collection {
   }
 
   /**
-   * The functional map that carries functions on `from` to functions on `to`, and the pointwise map back: the one
-   * by which labels are carried, which is kept, or, with options of {@link Points}, one made for points, in about 0.1 s.
+   * The functional map that transfers functions on `from` to functions on `to`, and the pointwise
+   * map back: the stored part map that propagates labels, or, with options of {@link Points}, a map
+   * between points, computed in about 0.1 s.
    */
   async map(from: string, to: string, options?: MapOptions): Promise<FunctionalMap> {
     const wish = options && ("agreement" in options ? options : { points: pointOptions(options) });
@@ -284,14 +297,15 @@ export class Collection {
   }
 
   /**
-   * Carries values at the faces of `from` to those of `to`, by a map between points: of an Int32Array one for each
-   * face, which are voted on; of a Float32Array as many for each face as there are, of which means are made.
+   * Transfers values at the faces of `from` to those of `to`, by a map between points. An
+   * Int32Array has one label for each face, transferred by majority; a Float32Array has one or more
+   * values for each face, which are averaged.
    */
   async transfer<T extends Int32Array | Float32Array>(values: T, from: string, to: string, points: Points = {}): Promise<T> {
     return (await this.transferred(values, from, to, points)).values;
   }
 
-  /** What {@link transfer} gives, with the quality of the map. */
+  /** The result of {@link transfer}, with the quality of the map. */
   async transferred<T extends Int32Array | Float32Array>(
     values: T,
     from: string,
@@ -314,21 +328,22 @@ export class Collection {
     return { values: raw.array(type, reply.values).data, quality: mapQuality(reply.quality) };
   }
 
-  /** Which part of `a` matches which part of `b`. */
+  /** The matching parts of `a` and `b`. */
   async matchParts(a: string, b: string): Promise<PartMatches> {
     const request = { collection: this.name, shapeA: a, shapeB: b };
     return plain((await this.library.call("getPartCorrespondence", request))[0]);
   }
 
-  /** The shapes most like one shape, nearest first. */
+  /** The shapes most similar to one shape, nearest first. */
   async nearest(name: string, limit = 5): Promise<Neighbor[]> {
     const [reply] = await this.library.call("nearest", { collection: this.name, shape: name, limit });
     return reply.neighbors.map(plain);
   }
 
   /**
-   * Labels faces of a shape by hand: an integer for each (−1 leaves one alone), one label for some faces, or
-   * one for a part. They never change again by themselves; other shapes follow: {@link waitIdle}.
+   * Labels faces of a shape by hand: an integer for each face (−1 leaves it unchanged), one label
+   * for some faces, or one for a part. Only a person changes these labels again; other shapes
+   * follow: {@link waitIdle}.
    */
   async correct(
     name: string,
@@ -352,28 +367,28 @@ export class Collection {
     return { ...plain(reply), jobId: reply.jobId };
   }
 
-  /** Gives a label, named by its id or the name it has, a name. */
+  /** Gives a label, selected by its id or present name, a name. */
   async nameLabel(label: number | string, name: string): Promise<Label> {
     const request = { collection: this.name, label: await this.#label(label), name };
     const [reply] = await this.library.call("nameLabel", request);
     return present(reply.label);
   }
 
-  /** Makes one label of two: faces of `label` carry `into` from now on. Both by id or name. */
+  /** Merges two labels, given by id or name: faces of `label` have `into` from now on. */
   async merge(label: number | string, into: number | string): Promise<ChangedLabel> {
     const request = { collection: this.name, label: await this.#label(label), into: await this.#label(into) };
     const [reply] = await this.library.call("mergeLabels", request);
     return { ...present(reply.label), nChanged: Number(reply.nShapes) };
   }
 
-  /** Makes two labels of one, by id or name, and returns the new one. */
+  /** Splits a label, given by id or name, and returns the new one. */
   async split(label: number | string): Promise<ChangedLabel> {
     const request = { collection: this.name, label: await this.#label(label) };
     const [reply] = await this.library.call("splitLabel", request);
     return { ...present(reply.label), nChanged: Number(reply.nShapes) };
   }
 
-  /** The id of a label; text that is all digits is one, other text the name of a label in use. */
+  /** The id of a label; text of digits is an id, other text the name of a label in use. */
   async #label(label: number | string): Promise<number> {
     if (typeof label === "number") return label;
     if (/^[0-9]+$/.test(label)) return Number(label);
@@ -381,17 +396,17 @@ export class Collection {
     const found = inUse.filter((l) => label !== "" && l.name === label).map((l) => l.id);
     if (found.length === 0) throw new CosegError(`no label of ${this.name} is named ${JSON.stringify(label)}`);
     if (found.length > 1) {
-      throw new CosegError(`${found.length} labels are named ${JSON.stringify(label)}, say which by its id: ${found.join(", ")}`);
+      throw new CosegError(`${found.length} labels are named ${JSON.stringify(label)}, choose one by its id: ${found.join(", ")}`);
     }
     return found[0]!;
   }
 
-  /** Takes back the newest correction, name, merge, split or change of the up axis. */
+  /** Undoes the newest correction, name, merge, split or change of the up axis. */
   async undo(): Promise<Undone> {
     return plain((await this.library.call("undo", { collection: this.name }))[0]);
   }
 
-  /** The shape whose labelling by a person would help most, or undefined if there is none. */
+  /** The shape that is most worth labelling by hand, or undefined if there is none. */
   async suggest(): Promise<Suggestion | undefined> {
     try {
       return plain((await this.library.call("suggestNext", { collection: this.name }))[0]);
@@ -414,9 +429,9 @@ export class Collection {
   }
 
   /**
-   * Events in order, each once and none left out: those after `since` (by default those from now on), then as
-   * they happen, without end. What the event socket drops is read from the log. A daemon that is restarted is
-   * waited for, at most `patience` seconds (without end).
+   * Events in order, each exactly once: those after `since` (default: from now on), then new ones
+   * as they happen, without end. Events that the event socket drops are read from the log. If the
+   * daemon restarts, the client waits for it, at most `patience` seconds (default: without limit).
    */
   async *events(options: { since?: number; patience?: number } = {}): AsyncGenerator<Event> {
     let seen = options.since ?? (await this.info()).sequence;
@@ -435,12 +450,12 @@ export class Collection {
     }
   }
 
-  /** Events after `seen` until the subscription falls silent. */
+  /** Yields events after `seen` until the subscription falls silent. */
   async *#follow(subscription: Subscription, seen: number): AsyncGenerator<Event> {
     let newest: number | undefined;
     for (;;) {
       if (newest === undefined || newest > seen) {
-        // The log has what came before the subscription, and what it dropped.
+        // The log has the events before the subscription, and those that it dropped.
         let missed: Event[];
         try {
           missed = await this.eventsSince(seen);
@@ -470,7 +485,7 @@ export class Collection {
     }
   }
 
-  /** Where a daemon that may be away publishes. */
+  /** The event endpoint of a daemon that may be unreachable at the moment. */
   async #eventEndpoint(patience: number): Promise<string> {
     for (let waited = 0; ; ) {
       try {
@@ -483,7 +498,7 @@ export class Collection {
   }
 }
 
-/** A daemon that listens on all addresses names none: then the host is the one that is known. */
+/** A daemon that listens on all addresses names no host; the known host is used instead. */
 export function reachable(announced: string, endpoint: string): string {
   const every = /^tcp:\/\/(?:0\.0\.0\.0|\[::\]|\*):(\d+)$/.exec(announced);
   const known = /^tcp:\/\/(.+):\d+$/.exec(endpoint);

@@ -1,15 +1,15 @@
-/** What can go wrong: every failure is a {@link CosegError}, a refusal by the daemon a {@link Refused}. */
+/** The errors: every failure is a {@link CosegError}, a refusal by the daemon a {@link Refused}. */
 
 import { ErrorCode, ErrorReason, type Error as WireError } from "./gen/coseg/v1/error_pb.js";
 
-/** Anything that this package throws by itself. */
+/** Base of all errors that this package throws. */
 export class CosegError extends Error {
   override get name(): string {
     return this.constructor.name;
   }
 }
 
-/** No sign of life from a daemon at the endpoint for as long as was asked to wait. */
+/** No daemon at the endpoint has answered within the timeout. */
 export class NoAnswer extends CosegError {
   constructor(
     readonly endpoint: string,
@@ -22,13 +22,15 @@ export class NoAnswer extends CosegError {
 /** The daemon's reply cannot be understood. */
 export class BadReply extends CosegError {}
 
-/** What was given as a mesh is none; nothing was sent. */
+/** The mesh is invalid; nothing was sent. */
 export class BadMesh extends CosegError {}
 
-/** A collection's log ends before events that were seen: another library is served there now. */
+/**
+ * A collection's log ends before events that were already received: another library is served now.
+ */
 export class EventLogRewound extends CosegError {}
 
-/** What a refusal is about. */
+/** The subject of a refusal. */
 export interface Place {
   /** Path of the field of the request, such as `shapes[3].name`. */
   readonly field?: string;
@@ -40,7 +42,7 @@ export interface Place {
   readonly byteOffset?: number;
   /** Line of the text file, from 1. */
   readonly line?: number;
-  /** The job that goes on although the request's deadline passed. */
+  /** The job that continues although the request's deadline has passed. */
   readonly jobId?: bigint;
 }
 
@@ -52,7 +54,7 @@ export class Refused extends CosegError {
   readonly reason: string;
   /** For people: the value and the limit. */
   readonly detail: string;
-  /** What it is about, where that is one thing. */
+  /** The subject, if it is a single one. */
   readonly place: Place;
   /** Seconds after which the same request may succeed; undefined: repeating it is useless. */
   readonly retryAfter: number | undefined;
@@ -71,23 +73,23 @@ export class Refused extends CosegError {
   }
 }
 
-/** The request or the mesh is wrong, whatever the state of the library. */
+/** The request or the mesh is invalid, regardless of the state of the library. */
 export class InvalidArgument extends Refused {}
-/** What the request names does not exist. */
+/** An object that the request names does not exist. */
 export class NotFound extends Refused {}
-/** What the request would create exists and differs. */
+/** An object that the request would create exists and differs. */
 export class AlreadyExists extends Refused {}
-/** The request is right, but not in this state of the library or the daemon. */
+/** The request is valid, but not in this state of the library or the daemon. */
 export class FailedPrecondition extends Refused {}
 /** The daemon is at a limit; see `retryAfter`. */
 export class ResourceExhausted extends Refused {}
-/** The request's deadline passed; a change that was begun still happens. */
+/** The request's deadline passed; a change that has begun is still finished. */
 export class DeadlineExceeded extends Refused {}
 /** A client cancelled the work. */
 export class Cancelled extends Refused {}
 /** The configuration, the transport or the client's role does not allow it. */
 export class PermissionDenied extends Refused {}
-/** Stored data is damaged: `coseg check` names it. */
+/** Stored data are damaged: `coseg check` names them. */
 export class DataLoss extends Refused {}
 /** A fault of the daemon. */
 export class Internal extends Refused {}

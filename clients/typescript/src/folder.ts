@@ -1,13 +1,14 @@
-/** The folder in which daemon and clients meet when nobody names an endpoint. */
+/** Chooses and checks the folder in which daemon and clients meet if no endpoint is named. */
 
 import { lstatSync, mkdirSync, statSync, type Stats } from "node:fs";
 import { dirname } from "node:path";
 import { CosegError } from "./errors.js";
 
 /**
- * `$RUNTIME_DIRECTORY`, else `$XDG_RUNTIME_DIR/coseg`, else `/tmp/coseg-UID`. Throws {@link CosegError} if anybody but
- * this user and root could listen there. The folder of a service may let a group in, that of a user nobody. One below
- * `/tmp` that is missing is made, so that nobody else makes it while the client waits for a daemon.
+ * `$RUNTIME_DIRECTORY`, else `$XDG_RUNTIME_DIR/coseg`, else `/tmp/coseg-UID`. Throws {@link
+ * CosegError} if anybody but this user and root could listen there. The folder of a service may let
+ * a group in; that of a user must be closed to others. A missing folder below `/tmp` is created, so
+ * that nobody else creates it while the client waits for a daemon.
  */
 export function defaultFolder(): string {
   const { RUNTIME_DIRECTORY, XDG_RUNTIME_DIR } = process.env;
@@ -27,9 +28,12 @@ export function defaultFolder(): string {
   return folder;
 }
 
-/** Throws if the folder, or a link to it, belongs to another user, or others may do what the bits say. */
+/**
+ * Throws if the folder, or a link to it, belongs to another user, or others may do what the bits
+ * say.
+ */
 export function checkFolder(folder: string, forbidden: number): void {
-  // A link is judged as well as what it leads to: who can change it can lead elsewhere.
+  // Both a link and its target are checked: a user who can change the link can redirect it.
   for (const look of [lstatSync, statSync]) {
     let found: Stats;
     try {

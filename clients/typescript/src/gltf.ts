@@ -1,15 +1,15 @@
 /**
- * A `.gltf` with buffers in files beside it becomes one binary file (GLB).
+ * Packs a `.gltf` with its buffers in separate files into one binary file (GLB).
  *
- * A buffer is followed only within the folder of the file, by a relative path, and only if positions or
- * indices are in it. Textures and whatever else the file names stay where they are.
+ * A buffer is read only from the folder of the file, by a relative path, and only if it contains
+ * positions or indices. Textures and other files are not read.
  */
 
 import { readFile, realpath, stat } from "node:fs/promises";
 import { dirname, extname, isAbsolute, join, relative, sep } from "node:path";
 import { BadMesh } from "./errors.js";
 
-/** Extensions of views that name buffers themselves. */
+/** Extensions whose views name buffers themselves. */
 const COMPRESSIONS = ["EXT_meshopt_compression", "KHR_meshopt_compression"] as const;
 
 interface Part {
@@ -34,7 +34,9 @@ interface Root {
   buffers?: Buffer0[];
 }
 
-/** What is sent for the file at a path. Throws {@link BadMesh} or what reading the file throws. */
+/**
+ * The bytes to send for the file at a path. Throws {@link BadMesh} or an error of reading the file.
+ */
 export async function readMesh(path: string): Promise<Uint8Array> {
   const data = await readFile(path);
   if (![".gltf", ".glb"].includes(extname(path).toLowerCase()) || data.subarray(0, 4).toString("latin1") === "glTF") {
@@ -49,13 +51,13 @@ export async function readMesh(path: string): Promise<Uint8Array> {
       uris.filter((entry): entry is readonly [number, string] => entry[1] !== undefined && !/^data:/i.test(entry[1])),
     );
   } catch {
-    // The daemon says what is wrong with it.
+    // The daemon reports the fault.
     return data;
   }
   return external.size > 0 ? pack(root, external, path) : data;
 }
 
-/** The buffers that positions and indices are in. */
+/** The buffers that contain positions and indices. */
 function needed(root: Root): number[] {
   const primitives = (root.meshes ?? []).flatMap((mesh) => mesh.primitives);
   const accessors = primitives.flatMap((p) => [p.attributes.POSITION, p.indices]).filter((i) => i !== undefined);
@@ -70,7 +72,7 @@ function needed(root: Root): number[] {
   return [...new Set(buffers)];
 }
 
-/** A view, and what names a buffer in its place. */
+/** A view, and the objects that name a buffer in its place. */
 function parts(view: View): Part[] {
   const compressed = COMPRESSIONS.map((name) => view.extensions?.[name]);
   return [view, ...compressed.filter((part) => part !== undefined)];
@@ -80,7 +82,7 @@ async function pack(root: Root, external: Map<number, string>, path: string): Pr
   const pieces: Uint8Array[] = [];
   let length = 0;
   const rest: Buffer0[] = [{ byteLength: 0 }];
-  // For each buffer its new index, and where it begins there.
+  // For each buffer its new index, and its offset in the new buffer.
   const moved: [index: number, begin: number][] = [];
   for (const [index, buffer] of root.buffers!.entries()) {
     const uri = external.get(index);
@@ -119,7 +121,7 @@ async function pack(root: Root, external: Map<number, string>, path: string): Pr
   ]);
 }
 
-/** The bytes of a buffer in a file beside the mesh. */
+/** The bytes of a buffer in a separate file. */
 async function file(index: number, buffer: Buffer0, uri: string, mesh: string): Promise<Uint8Array> {
   const fault = (why: string) => new BadMesh(`${mesh}: buffer ${index} is in "${uri}", ${why}`);
   if (/^[a-z][a-z0-9+.-]*:/i.test(uri)) throw fault("and only files beside the mesh are read: download it");

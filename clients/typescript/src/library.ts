@@ -1,4 +1,4 @@
-/** The client: a library of shapes kept by a daemon. */
+/** The client of a daemon's library of shapes. */
 
 import { randomUUID } from "node:crypto";
 import { setTimeout as sleep } from "node:timers/promises";
@@ -15,11 +15,16 @@ import { curveFromEnv, Transport } from "./transport.js";
 import type { CollectionInfo, FunctionalMap, Hello, Job, MapOptions, Options, RetriedJob, Settings, Stats } from "./types.js";
 import { plain, Raw } from "./wire.js";
 
-/** Longest single wait in the daemon: so long a change of mind takes to be noticed. @internal */
+/**
+ * Longest single wait in the daemon, and hence the longest delay until a cancellation takes effect.
+ * @internal
+ */
 export const WAIT_MS = 1_000;
-/** Between tries while a daemon drains and another has not taken its place. */
+/** Delay between tries while a daemon drains and none has replaced it. */
 const DRAINING_RETRY_MS = 500;
-/** What a daemon that drains answers at once is asked again after this. @internal */
+/**
+ * Delay after which a request is repeated to a draining daemon, which answers at once. @internal
+ */
 export const PACE_MS = 20;
 
 type Bodies = NonNullable<MessageInitShape<typeof RequestSchema>["body"]>;
@@ -27,18 +32,18 @@ type Body = Exclude<Request["body"]["case"], undefined>;
 type Init<C extends Body> = Extract<Bodies, { case: C }>["value"];
 type Result<C extends Body> = Extract<Reply["result"], { case: C }>["value"];
 
-/** Where a daemon of this user listens when nobody says otherwise. Throws if somebody else could listen there. */
+/** The default endpoint of this user's daemon. Throws if another user could listen there. */
 export function defaultEndpoint(): string {
   return process.env.COSEG_ENDPOINT || `ipc://${defaultFolder()}/coseg.sock`;
 }
 
-/** A connection to a daemon, and the library that it keeps. That somebody listens shows with the first request. */
+/** A connection to a daemon and its library. A missing daemon is noticed at the first request. */
 export class Library {
   readonly endpoint: string;
   readonly clientId: string;
   /** @internal */
   readonly transport: Transport;
-  // Request ids of two programs under one client id must differ.
+  // Request ids of two programs with the same client id must differ.
   readonly #run = randomUUID().slice(0, 13);
   #n = 0;
   #hello: HelloReply | undefined;
@@ -55,8 +60,9 @@ export class Library {
   }
 
   /**
-   * Sends any request of the protocol: `await lib.call("getJob", { jobId: 7n })`. A daemon that is at a
-   * limit is asked again after the delay it names, one that drains until another has taken its place.
+   * Sends any request of the protocol: `await lib.call("getJob", { jobId: 7n })`. If the daemon is
+   * at a limit, the request is repeated after the delay that it names; if it drains, until another
+   * daemon has replaced it.
    */
   async call<C extends Body>(
     body: C,
@@ -71,7 +77,7 @@ export class Library {
       body: { case: body, value } as Bodies,
     });
     const frames = [toBinary(RequestSchema, request), ...(options.frames ?? [])];
-    // A frame beyond the limit would end the connection without a word.
+    // A frame beyond the limit would end the connection silently.
     const nBytes = frames.reduce((n, frame) => n + frame.length, 0);
     const limit = this.#hello?.limits?.maxMessageBytes;
     if (limit !== undefined && BigInt(nBytes) > limit) {
@@ -88,7 +94,7 @@ export class Library {
     }
   }
 
-  /** Who the daemon is. */
+  /** The daemon's description of itself. */
   async hello(): Promise<Hello> {
     [this.#hello] = await this.call("hello", {});
     return plain(this.#hello);
@@ -107,8 +113,8 @@ export class Library {
   }
 
   /**
-   * Stops the daemon when the work in hand is done; only over `ipc`. How many accepted shapes are not placed yet: those not
-   * begun are resumed at the next start.
+   * Stops the daemon when its current work is done; only over `ipc`. Returns the number of accepted
+   * shapes that are not yet placed; those not begun are resumed at the next start.
    */
   async drain(): Promise<number> {
     return Number((await this.call("drain", {}))[0].nQueued);
@@ -126,14 +132,14 @@ export class Library {
   }
 
   /**
-   * The collection of that name. The first shape added creates it, with these settings, if it is missing; a
-   * collection that has others is refused then.
+   * The collection of that name. If it is missing, the first added shape creates it with these
+   * settings; if it exists with other settings, that addition is refused.
    */
   collection(name: string, settings: Settings = {}): Collection {
     return new Collection(this, name, spec(settings));
   }
 
-  /** The only collection there is. */
+  /** The only collection of the library. */
   async onlyCollection(): Promise<Collection> {
     const names = (await this.collections()).map((c) => c.spec?.name ?? "");
     const [only] = names;
@@ -143,18 +149,21 @@ export class Library {
     return this.collection(only);
   }
 
-  /** The functional map that carries functions on `from` to functions on `to`. */
+  /** The functional map that transfers functions on `from` to functions on `to`. */
   async map(from: string, to: string, collection?: string, options?: MapOptions): Promise<FunctionalMap> {
     const within = collection === undefined ? await this.onlyCollection() : this.collection(collection);
     return within.map(from, to, options);
   }
 
-  /** A job as it stands. */
+  /** The present state of a job. */
   async job(jobId: bigint): Promise<Job> {
     return job((await this.call("getJob", { jobId }))[0].job);
   }
 
-  /** A job each time it has changed, until it is finished; also across restarts of the daemon. */
+  /**
+   * Yields a job each time it has changed, until it is finished; also across restarts of the
+   * daemon.
+   */
   async *watch(jobId: bigint): AsyncGenerator<Job> {
     for await (const message of this.watchWire(jobId)) yield job(message);
   }
@@ -172,12 +181,14 @@ export class Library {
     }
   }
 
-  /** Cancels the shapes of a job that are not placed yet. */
+  /** Cancels the shapes of a job that are not yet placed. */
   async cancel(jobId: bigint): Promise<Job> {
     return job((await this.call("cancelJob", { jobId }))[0].job);
   }
 
-  /** Jobs, the newest first; with `failed` those of which a shape failed, each with its failed shapes alone. */
+  /**
+   * Jobs, newest first; with `failed` only those with failed shapes, each with these shapes alone.
+   */
   async *jobs(options: { failed?: boolean; collection?: string } = {}): AsyncGenerator<Job> {
     let before = 0n;
     for (;;) {
@@ -189,7 +200,10 @@ export class Library {
     }
   }
 
-  /** Queues the failed shapes of a job again, once what made them fail is mended. With keys: for the role `admin`. */
+  /**
+   * Queues the failed shapes of a job again, after the cause was removed. With keys it needs the
+   * role `admin`.
+   */
   async retry(jobId: bigint): Promise<RetriedJob> {
     const [reply] = await this.call("retryJob", { jobId });
     return { ...job(reply.job), nQueued: reply.nQueued };

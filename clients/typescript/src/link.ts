@@ -1,21 +1,22 @@
 /**
- * One connection without its socket: what to send when, until every request has its answer.
+ * Implements one connection without its socket: it decides what to send when, until every request
+ * has its answer.
  *
- * A ZeroMQ socket hides that a daemon was gone for a while, and with it what was under way. So while
- * answers are awaited, a Hello is sent once a second. Its reply shows that the daemon lives, and whether
- * it is still the one that got the requests: if not, they are sent again, which the idempotency key
- * makes harmless. The timeout is for silence, not for work.
+ * A ZeroMQ socket hides that a daemon was away for a while, and that requests in flight were lost
+ * with it. So while answers are pending, a Hello is sent once a second. Its reply shows that the
+ * daemon is alive, and whether it is the one that got the requests: if not, they are sent again,
+ * which the idempotency key makes harmless. The timeout limits silence, not work.
  */
 
 import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
 import { BadReply, NoAnswer } from "./errors.js";
 import { ReplySchema, RequestSchema, type Reply } from "./gen/coseg/v1/message_pb.js";
 
-/** Milliseconds of silence after which the daemon is asked whether it lives. */
+/** Milliseconds of silence after which the client sends a Hello. */
 export const PING_MS = 1_000;
 /**
- * Milliseconds after which a request is sent again although the daemon lives: it drops replies to clients
- * that do not read. Doubled each time.
+ * Milliseconds after which a request is sent again although the daemon is alive, because it drops
+ * replies to clients that do not read. Doubled each time.
  */
 export const RESEND_MS = 20_000;
 
@@ -42,18 +43,18 @@ export class Link {
     readonly timeout: number,
   ) {}
 
-  /** Whether any answer is awaited. */
+  /** Whether any answer is pending. */
   get waiting(): boolean {
     return this.#pending.size > 0;
   }
 
-  /** Notes a request; the caller sends it. */
+  /** Records a request; the caller sends it. */
   begin(requestId: string, frames: Frames, now: number): void {
     if (this.#pending.size === 0) this.#heard = this.#pinged = now;
     this.#pending.set(requestId, { frames, resendAt: now + RESEND_MS, resendMs: RESEND_MS });
   }
 
-  /** Notes that a request could not be sent: it is due at the next tick. */
+  /** Records that a request could not be sent, so that it is due at the next tick. */
   unsent(requestId: string): void {
     const pending = this.#pending.get(requestId);
     if (pending) pending.resendAt = 0;
@@ -64,12 +65,12 @@ export class Link {
     this.#pending.delete(requestId);
   }
 
-  /** When {@link tick} is to be called, unless something arrives before. */
+  /** The time at which to call {@link tick}, unless a message arrives earlier. */
   nextTick(): number {
     return Math.max(this.#pinged, this.#heard) + PING_MS;
   }
 
-  /** What is to be sent now, with its id. Throws {@link NoAnswer} after too long a silence. */
+  /** The messages to send now, with their ids. Throws {@link NoAnswer} after too long a silence. */
   tick(now: number): [string, Frames][] {
     if (this.#pending.size === 0 || now < this.nextTick()) return [];
     if (now - this.#heard > this.timeout * 1000) throw new NoAnswer(this.endpoint, this.timeout);
@@ -85,7 +86,7 @@ export class Link {
     return due;
   }
 
-  /** The reply to a request, or undefined for one that nobody waits for. */
+  /** The reply to a request, or undefined for a request that is not pending. */
   receive(header: Uint8Array, now: number): Reply | undefined {
     this.#heard = now;
     let reply: Reply;
@@ -97,7 +98,7 @@ export class Link {
     if (reply.result.case === "hello") {
       const { instance } = reply.result.value;
       if (this.#instance !== "" && instance !== this.#instance) {
-        // What was sent before may be lost with the daemon that got it.
+        // Requests sent earlier may be lost with the daemon that got them.
         for (const pending of this.#pending.values()) pending.resendAt = 0;
         this.#pinged = this.#heard = now - PING_MS;
       }

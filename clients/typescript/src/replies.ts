@@ -1,4 +1,4 @@
-/** What the daemon tells becomes what the client returns, and settings what it is asked with. */
+/** Converts replies to results of the client, and settings to requests. */
 
 import { create } from "@bufbuild/protobuf";
 import { BadReply, CosegError, refused } from "./errors.js";
@@ -8,7 +8,7 @@ import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/cos
 import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Settings } from "./types.js";
 import { plain, type Raw } from "./wire.js";
 
-/** Most kinds of parts that a collection can be told to have. */
+/** Maximum number of part kinds of a collection. */
 const MAX_PARTS = 64;
 
 export function up(name: Settings["up"]): Up {
@@ -82,7 +82,7 @@ export function failed(name: string, error: Error | undefined, outcome: "failed"
   return { name, outcome, ok: false, ...(error && { error }), version: 0, sequence: 0, ...NOTHING_DONE };
 }
 
-/** What became of a shape of a job, once it is over. */
+/** The result of a completed shape of a job. */
 export function added(item: JobItem | undefined): Added | undefined {
   switch (item?.state) {
     case ItemState.DONE: {

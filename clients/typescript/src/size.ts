@@ -1,4 +1,4 @@
-/** Numbers of bytes as messages tell them. */
+/** Formats numbers of bytes for messages. */
 
 const UNITS = [
   ["TiB", 2 ** 40],
@@ -7,7 +7,7 @@ const UNITS = [
   ["KiB", 2 ** 10],
 ] as const;
 
-/** `64 MiB` where it is just that, `76.3 MiB (80000000 bytes)` where it is rounded. */
+/** Formats a size: `64 MiB` if that is exact, `76.3 MiB (80000000 bytes)` if it is rounded. */
 export function inWords(n: number): string {
   const found = UNITS.find(([, unit]) => n >= unit);
   if (found === undefined) return n === 1 ? "1 byte" : `${n} bytes`;
@@ -15,7 +15,7 @@ export function inWords(n: number): string {
   return n % unit === 0 ? `${n / unit} ${name}` : `${(n / unit).toFixed(1)} ${name} (${n} bytes)`;
 }
 
-/** That something is larger than a limit, and which setting of the daemon raises that. */
+/** The message that something exceeds a limit, with the setting of the daemon that raises it. */
 export function beyond(what: string, found: number, limit: number, key: string): string {
   return `${what} ${inWords(found)}, the limit is ${inWords(limit)} (${key} of the daemon's configuration)`;
 }

@@ -1,4 +1,4 @@
-/** ZeroMQ sockets around {@link Link}. */
+/** Connects {@link Link} with ZeroMQ sockets. */
 
 import { readFileSync } from "node:fs";
 import { Dealer, Subscriber } from "zeromq";
@@ -6,19 +6,28 @@ import { CosegError } from "./errors.js";
 import type { Reply } from "./gen/coseg/v1/message_pb.js";
 import { Link, type Frames } from "./link.js";
 
-/** Keys of an encrypted connection, each 40 characters of Z85: the daemon's public one, and this client's pair. */
+/**
+ * Keys of an encrypted connection, each 40 characters of Z85: the daemon's public key, and this
+ * client's pair.
+ */
 export interface Curve {
   readonly server: string;
   readonly public: string;
   readonly secret: string;
 }
 
-/** The keys that `coseg keys generate` made: the daemon's `server.pub` and this client's `NAME.key`. */
+/**
+ * Reads the keys that `coseg keys generate` wrote: the daemon's `server.pub` and this client's
+ * `NAME.key`.
+ */
 export function curveFromFiles(server: string, client: string): Curve {
   return { server: key(server, "public"), public: key(client, "public"), secret: key(client, "secret") };
 }
 
-/** The keys of the files that `$COSEG_SERVER_KEY` and `$COSEG_CLIENT_KEY` name; undefined where neither is set. */
+/**
+ * Reads the keys in the files named by `$COSEG_SERVER_KEY` and `$COSEG_CLIENT_KEY`; undefined if
+ * neither is set.
+ */
 export function curveFromEnv(): Curve | undefined {
   const { COSEG_SERVER_KEY: server, COSEG_CLIENT_KEY: client } = process.env;
   if (!server && !client) return undefined;
@@ -69,14 +78,14 @@ export class Transport {
     this.#socket.connect(endpoint);
   }
 
-  /** Closes the socket; who still waits is rejected. */
+  /** Closes the socket; pending requests are rejected. */
   close(): void {
     this.#failAll(new CosegError("the connection was closed"));
     clearTimeout(this.#timer);
     this.#socket.close();
   }
 
-  /** Sends a request, again if need be, and resolves to the reply and its raw frames. */
+  /** Sends a request, repeatedly if necessary, and resolves to the reply and its raw frames. */
   async exchange(requestId: string, frames: Frames): Promise<Answer> {
     if (!this.#reading) void this.#read();
     this.#link.begin(requestId, frames, performance.now());
@@ -137,7 +146,7 @@ export class Transport {
     }
   }
 
-  /** A socket that receives what is published under the topics. */
+  /** A socket that receives messages under the topics. */
   subscribe(endpoint: string, topics: readonly string[], silenceMs: number): Subscription {
     const socket = new Subscriber({ linger: 0, receiveTimeout: silenceMs, ...curveOptions(this.curve) });
     socket.subscribe(...topics);

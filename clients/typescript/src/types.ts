@@ -1,4 +1,4 @@
-/** What the client takes and returns. */
+/** The types that the client takes and returns. */
 
 import type {
   GetPartCorrespondenceReply,
@@ -15,52 +15,55 @@ import type { Shape as WireShape } from "./gen/coseg/v1/shape_pb.js";
 import type { Curve } from "./transport.js";
 import type { Matrix, Plain } from "./wire.js";
 
-/** Who the daemon is. */
+/** The daemon's description of itself. */
 export type Hello = Plain<HelloReply>;
 /** The daemon's counters. */
 export type Stats = Plain<StatsReply>;
-/** A collection as it stands. */
+/** The present state of a collection. */
 export type CollectionInfo = Plain<WireCollection>;
 /** A label of a collection. */
 export type Label = Plain<LabelInfo>;
-/** A shape as it stands. */
+/** The present state of a shape. */
 export type Shape = Plain<WireShape>;
 /** Shapes that were accepted together. Its id is exact. */
 export type Job = Omit<Plain<WireJob>, "jobId"> & { readonly jobId: bigint };
-/** Something that happened to a collection; `kind.case` says what. */
+/** A change of a collection; `kind.case` names its kind. */
 export type Event = Plain<WireEvent>;
-/** A job whose failed shapes were queued again, and how many were. */
+/** A job whose failed shapes were queued again, with their number. */
 export type RetriedJob = Job & { readonly nQueued: number };
-/** A label after a merge or a split, and on how many shapes labels changed at once. */
+/** A label after a merge or a split, and the number of shapes whose labels changed immediately. */
 export type ChangedLabel = Label & { readonly nChanged: number };
-/** A correction that is durable; the job carries it to the other shapes. */
+/** A durable correction; the job propagates it to the other shapes. */
 export type Corrected = Omit<Plain<CorrectLabelsReply>, "jobId"> & { readonly jobId: bigint };
-/** Which part of one shape matches which part of another. */
+/** A part of one shape and the matching part of another. */
 export type PartMatches = Plain<GetPartCorrespondenceReply>;
-/** A shape and how far it is. */
+/** A shape and its distance. */
 export type Neighbor = Plain<WireNeighbor>;
-/** How good a functional map is; what it does not say of its kind of map is undefined. */
+/** The quality of a functional map; figures that do not apply to its kind of map are undefined. */
 export type MapQuality = Plain<WireMapQuality>;
-/** How a map agrees with those by way of other shapes of its collection. */
+/** The agreement of a map with maps by way of other shapes of its collection. */
 export type MapAgreement = Plain<WireMapAgreement>;
-/** What was undone. */
+/** The undone change. */
 export type Undone = Plain<UndoReply>;
-/** What became of a change of a collection's settings, and how many shapes wait to be relabelled. */
+/**
+ * The result of a change of a collection's settings, and the number of shapes that wait to be
+ * relabelled.
+ */
 export type Updated = Plain<UpdateCollectionReply>;
-/** The shape whose labelling by a person would help most. */
+/** The shape that is most worth labelling by hand. */
 export type Suggestion = Plain<SuggestNextReply>;
-/** Whether a collection has anything left to do. */
+/** Whether a collection has work left. */
 export type Idle = Plain<WaitIdleReply>;
 
 /** The labels of a shape, one for each face of its file, in the file's order; −1: unlabelled. */
 export interface Labelling {
   readonly version: number;
   readonly labels: Int32Array;
-  /** Probability of each label, if it was asked for. */
+  /** Probability of each label, if it was requested. */
   readonly confidence?: Float32Array;
 }
 
-/** What became of one shape that was added. */
+/** The result of adding one shape. */
 export interface Added {
   readonly name: string;
   readonly outcome: "added" | "unchanged" | "replaced" | "failed" | "cancelled";
@@ -75,7 +78,7 @@ export interface Added {
   readonly nMaps: number;
   /** Stored shapes whose labels were recomputed with it. */
   readonly nRelabelled: number;
-  /** Of the maps those that do not agree with the maps between the shapes they come from. */
+  /** Number of these maps that disagree with the maps between their source shapes. */
   readonly nInconsistent: number;
   /** Milliseconds by stage, in order. */
   readonly stages: Readonly<Record<string, number>>;
@@ -92,7 +95,10 @@ export interface Spectrum {
   readonly area: number;
 }
 
-/** The working mesh of a shape and what its segmentation is computed from; see the protocol. */
+/**
+ * The working mesh of a shape and the data from which its segmentation is computed; see the
+ * protocol.
+ */
 export interface Descriptors {
   readonly vertices: Matrix<Float32Array>;
   readonly faces: Matrix<Uint32Array>;
@@ -103,7 +109,7 @@ export interface Descriptors {
   readonly signature: Float32Array;
 }
 
-/** The map that carries functions on shape 1 (`from`) to functions on shape 2 (`to`). */
+/** The map that transfers functions on shape 1 (`from`) to functions on shape 2 (`to`). */
 export interface FunctionalMap {
   readonly from: string;
   readonly to: string;
@@ -112,73 +118,93 @@ export interface FunctionalMap {
   /** (n2) for each vertex of shape 2's working mesh one of shape 1's. */
   readonly p2p21: Uint32Array;
   readonly quality: MapQuality;
-  /** (n2) 1 where something of shape 1 corresponds to the vertex of shape 2's working mesh, else 0. */
+  /** (n2) 1 for each vertex of shape 2's working mesh that has a counterpart on shape 1, else 0. */
   readonly matched: Uint32Array;
-  /** Of maps for parts: (n2) probability that a label carried there is right; 0 where nothing corresponds. */
+  /**
+   * For part maps: (n2) probability that a label transferred there is right; 0 without counterpart.
+   */
   readonly confidence?: Float32Array;
-  /** Of maps for parts, if it was asked for: whether it agrees with the others of the collection. */
+  /** For part maps, if it was requested: the agreement with the others of the collection. */
   readonly agreement?: MapAgreement;
-  /** The best map of the other orientation, left for right, if it was asked for and there is one. */
+  /**
+   * The best map of the other orientation, which exchanges left and right, if it was requested and
+   * exists.
+   */
   readonly alternative?: FunctionalMap;
-  /** What that costs over what this one does: near 1, the shapes themselves hardly say which is meant. */
+  /**
+   * Cost of that map over the cost of this one; near 1, the shapes hardly determine which map is
+   * right.
+   */
   readonly alternativeCost?: number;
-  /** Vertices of shape 1's working mesh; 0 from a daemon that does not say. */
+  /** Number of vertices of shape 1's working mesh; 0 if the daemon is too old to set it. */
   readonly n1: number;
 }
 
-/** How a map between points is made. */
+/** Options of a map between points. */
 export interface Points {
-  /** Vertices of the working meshes that correspond, `from` first. */
+  /** Corresponding vertices of the working meshes, `from` first. */
   readonly landmarks?: readonly (readonly [number, number])[];
-  /** Which of the maps between shapes that have a reflection: without, the one that keeps it unless that is much worse. */
+  /**
+   * The orientation of a map between shapes that have a reflection; by default the map keeps
+   * orientation unless it is then much worse.
+   */
   readonly orientation?: "keep" | "reverse";
-  /** Rows and columns of `c12` (100, or as many as both shapes have). */
+  /** Rows and columns of `c12` (100, or fewer if the shapes have fewer eigenfunctions). */
   readonly k?: number;
-  /** Find the best map of the other orientation too. */
+  /** Whether to return the best map of the other orientation too. */
   readonly alternative?: boolean;
 }
 
-/** A map between points, or that for parts with how it agrees with the other kept maps. */
+/**
+ * Options for a map between points, or for the part map with its agreement with the other stored
+ * maps.
+ */
 export type MapOptions = Points | { readonly agreement: boolean };
 
-/** Values that were carried from the faces of one shape to those of another. */
+/** Values transferred from the faces of one shape to those of another. */
 export interface Transferred<T> {
-  /** One row for each face of `to`; −1 or NaN where nothing corresponds. */
+  /** One row for each face of `to`; −1 or NaN without counterpart. */
   readonly values: T;
-  /** How good the map is that carried them. */
+  /** Quality of the map that transferred them. */
   readonly quality: MapQuality;
 }
 
-/** The labels of all shapes of a collection as of one moment, by name. */
+/** The labels of all shapes of a collection at one moment, by name. */
 export interface Snapshot {
-  /** Events with a larger number come on top. */
+  /** Sequence number of the newest event that is contained; later events are not. */
   readonly sequence: number;
   readonly shapes: ReadonlyMap<string, Labelling>;
 }
 
-/** Settings of a collection that is created. */
+/** Settings of a new collection. */
 export interface Settings {
-  /** Number of part kinds; estimated if it is not given. */
+  /** Number of part kinds; estimated if omitted. */
   readonly parts?: number;
   /** The axis that points up. */
   readonly up?: "+x" | "-x" | "+y" | "-y" | "+z" | "-z" | "unknown" | "auto";
-  /** Which Laplacian. */
+  /** The Laplacian. */
   readonly operator?: "tufted" | "cotan" | "mesh-laplace";
-  /** Faces of the working mesh (the daemon's default). */
+  /** Number of faces of the working mesh (default: the daemon's). */
   readonly workingFaces?: number;
 }
 
 /** How to reach the daemon. */
 export interface Options {
-  /** `ipc://PATH` or `tcp://HOST:PORT`; else `$COSEG_ENDPOINT`, else the socket of this user's daemon. */
+  /**
+   * `ipc://PATH` or `tcp://HOST:PORT`; else `$COSEG_ENDPOINT`, else the socket of this user's
+   * daemon.
+   */
   readonly endpoint?: string;
   /**
-   * Seconds without any sign of life until {@link NoAnswer} (30). Work that takes longer while the daemon
-   * lives does not count; a daemon that restarts in this time gets the same requests again.
+   * Seconds without any answer until {@link NoAnswer} (30). Work that takes longer while the daemon
+   * is alive does not count; a daemon that restarts in this time gets the same requests again.
    */
   readonly timeout?: number;
-  /** Keys of an encrypted connection; else those of the files `$COSEG_SERVER_KEY` and `$COSEG_CLIENT_KEY`, if set. */
+  /**
+   * Keys of an encrypted connection; by default those in the files `$COSEG_SERVER_KEY` and
+   * `$COSEG_CLIENT_KEY`, if set.
+   */
   readonly curve?: Curve;
-  /** With a request's id the key under which changes have one effect; made up if it is not given. */
+  /** Together with a request's id the idempotency key of changes; generated if omitted. */
   readonly clientId?: string;
 }

@@ -1,4 +1,4 @@
-/** Values become frames and frames become values; nothing here touches a socket. */
+/** Converts values to frames and back, without sockets. */
 
 import { extname } from "node:path";
 import { create, type Message } from "@bufbuild/protobuf";
@@ -13,14 +13,17 @@ export interface Encoded {
   readonly data: Uint8Array;
 }
 
-/** A mesh as arrays: x, y, z of each vertex, and the vertices of each face, all of `faceSize` corners (3). */
+/**
+ * A mesh as arrays: x, y, z of each vertex, and the vertices of each face, all of `faceSize`
+ * corners (3).
+ */
 export interface Arrays {
   readonly vertices: Float32Array | Float64Array | readonly number[];
   readonly faces: Uint32Array | Int32Array | readonly number[];
   readonly faceSize?: number;
 }
 
-/** A mesh: the path of a file, the bytes of one, or arrays. */
+/** A mesh: the path of a file, the bytes of a file, or arrays. */
 export type Mesh = string | Encoded | Arrays;
 
 /** An array and its extents, row-major. */
@@ -90,7 +93,7 @@ export class Raw {
       throw new BadReply(`an array has element type ${ref?.dtype}, expected ${type.name}`);
     }
     const frame = this.#frame(ref.frame);
-    // A copy, for a frame need not begin where elements may.
+    // A copy is needed, since a frame may be unaligned for its elements.
     const data = new type(frame.slice().buffer as ArrayBuffer);
     if (data.length !== shape.reduce((a, b) => a * b, 1)) {
       throw new BadReply(`an array of shape ${shape} has ${data.length} elements`);
@@ -110,12 +113,12 @@ export class Raw {
   }
 }
 
-/** The format of that name or file extension. */
+/** The format with this name or file extension. */
 export function meshFormat(name: string): MeshFormat {
   // A GLB is a glTF in one binary file.
   if (name.toLowerCase() === "glb") return MeshFormat.GLTF;
   const format = MeshFormat[name.toUpperCase() as keyof typeof MeshFormat];
-  if (typeof format !== "number" || format === MeshFormat.UNSPECIFIED) throw new BadMesh(`${name} is no mesh format`);
+  if (typeof format !== "number" || format === MeshFormat.UNSPECIFIED) throw new BadMesh(`${name} is not a mesh format`);
   return format;
 }
 
@@ -124,7 +127,10 @@ export function formatName(format: MeshFormat): string {
   return (MeshFormat[format] ?? String(format)).toLowerCase();
 }
 
-/** A shape to add; its bytes go to `writer`. Throws {@link BadMesh} or what reading the file throws. */
+/**
+ * A shape to add; appends its bytes to `writer`. Throws {@link BadMesh} or an error of reading the
+ * file.
+ */
 export async function shapeInput(name: string, mesh: Mesh, replace: boolean, writer: FrameWriter): Promise<ShapeInput> {
   const shape = create(ShapeInputSchema, { name, replace });
   if (typeof mesh === "string") mesh = { format: extname(mesh).slice(1), data: await readMesh(mesh) };

@@ -1,4 +1,5 @@
-//! `coseg-bench maps --labels`: how well maps carry labels from a few shapes to another, and how well it is known beforehand.
+//! `coseg-bench maps --labels` measures how well maps transfer labels from a few shapes to another,
+//! and how well their confidence predicts that.
 
 use crate::error::{BenchError, Outcome};
 use crate::print::{print_line, table};
@@ -22,11 +23,11 @@ use serde_json::json;
 use std::path::Path;
 use std::time::Instant;
 
-/// Shapes that vote.
+/// Number of shapes that vote.
 const N_BEST: usize = 5;
-/// Draws of so few labelled shapes.
+/// Number of random draws of a few labelled shapes.
 const N_DRAWS: u64 = 3;
-/// What labels are carried by.
+/// The ways of transferring labels.
 const ARMS: [&str; 5] = [
     "maps",
     "descriptors",
@@ -34,7 +35,7 @@ const ARMS: [&str; 5] = [
     "maps and model",
     "descriptors and model",
 ];
-/// What shapes are ranked by.
+/// The criteria by which shapes are ranked.
 const RANKINGS: [&str; 3] = ["signature", "as placed", "confidence"];
 
 /// A described shape with its true labels.
@@ -46,14 +47,14 @@ pub(crate) struct Labelled {
     pub(crate) of_face: Vec<Option<u32>>,
 }
 
-/// The shapes of a category, ready to be mapped.
+/// The shapes of a category, prepared for maps.
 pub(crate) struct Ready {
     pub(crate) shapes: Vec<Labelled>,
     pub(crate) prepared: Vec<Prepared>,
     pub(crate) model: LabelModel,
-    /// Classes.
+    /// Number of classes.
     pub(crate) k: usize,
-    /// The labels they stand for.
+    /// The labels of the classes.
     pub(crate) kinds: Vec<i32>,
 }
 
@@ -61,7 +62,7 @@ pub(crate) struct Ready {
 struct Pair {
     map: FunctionalMap,
     by_descriptors: (Vec<u32>, Confidence),
-    /// Area share on which the labels it carries are right.
+    /// Area share on which the transferred labels are right.
     accuracy: f64,
     unlike: f64,
 }
@@ -69,13 +70,14 @@ struct Pair {
 /// Figures of a category.
 struct Row {
     name: String,
-    /// For 19 and for 5 labelled shapes, accuracy by each of [`ARMS`].
+    /// For 19 and for 5 labelled shapes, the accuracy of each of [`ARMS`].
     accuracy: [[f64; 5]; 2],
-    /// For each of [`RANKINGS`]: share of the five best that is among the first five, and accuracy of maps from these.
+    /// For each of [`RANKINGS`]: the share of the five best shapes that are among the first five,
+    /// and the accuracy of maps from these.
     ranking: [(f64, f64); 3],
     /// Accuracy of maps from the five best.
     oracle: f64,
-    /// Of each map what is known beforehand, and its accuracy.
+    /// The figures of each map that are known beforehand, and its accuracy.
     maps: Vec<([f64; 5], f64)>,
     matched: partial::Mask,
     map_ms: f64,
@@ -171,7 +173,7 @@ impl Labelled {
         right / total.max(1e-300)
     }
 
-    /// What it says of its faces `(m, k)`, 0 to 255.
+    /// The votes for its faces `(m, k)`, 0 to 255.
     fn vote(&self, k: usize) -> Vec<u8> {
         let mut out = vec![0; self.of_face.len() * k];
         for (row, class) in out.chunks_exact_mut(k).zip(&self.of_face) {
@@ -189,7 +191,7 @@ fn bench(category: &Category) -> Result<Row, BenchError> {
     let votes: Vec<Vec<u8>> = prep.shapes.iter().map(|s| s.vote(prep.k)).collect();
     let begin = Instant::now();
     let sides = |s: usize| (prep.shapes[s].description.view(), &prep.prepared[s]);
-    // Alone, before anything runs beside it.
+    // Measured alone, before other maps run concurrently.
     let alone = n.min(9);
     let mut times: Vec<f64> = (1..alone)
         .map(|i| {
@@ -382,8 +384,8 @@ fn target<'a>(
     }
 }
 
-/// Predicted and actual accuracy of maps, in five equal bins of the predicted one, and their rank correlation. Each category
-/// is predicted from the others where there are any.
+/// Predicted and actual accuracy of maps, in five equal bins of the predicted one, and their rank
+/// correlation. Each category is predicted from the others if there are any.
 fn calibration(rows: &[Row]) -> (Vec<(usize, f64, f64)>, f64) {
     let mut points: Vec<(f64, f64)> = Vec::new();
     for (r, row) in rows.iter().enumerate() {

@@ -1,11 +1,11 @@
-//! Why a measurement did not come about.
+//! The errors of a measurement.
 
 use coseg::daemon::StartError;
 use coseg::ipc::client::ClientError;
 use coseg::library::LibraryError;
 use std::path::Path;
 
-/// Why a measurement did not come about.
+/// The reason why a measurement failed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum BenchError {
     /// The daemon did not answer, or refused.
@@ -26,18 +26,18 @@ pub(crate) enum BenchError {
     /// A file could not be read or written.
     #[error("{path}: {source}")]
     File {
-        /// Which one.
+        /// The file.
         path: String,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// Nobody reads the output any more.
+    /// The reader of stdout has closed it.
     #[error("stdout: {0}")]
     Output(std::io::Error),
 }
 
 impl BenchError {
-    /// A file could not be read or written.
+    /// The error for a file that could not be read or written.
     pub(crate) fn file(path: &Path, source: std::io::Error) -> Self {
         Self::File {
             path: path.display().to_string(),
@@ -50,7 +50,7 @@ impl BenchError {
         matches!(self, Self::Usage(_))
     }
 
-    /// Whether there is nothing to report: the reader of a pipe has left.
+    /// Whether no message should be printed, because the reader of a pipe has closed it.
     pub(crate) fn is_silent(&self) -> bool {
         matches!(self, Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe)
     }

@@ -1,4 +1,4 @@
-//! `coseg-bench labels`: accuracy on meshes whose parts are known, and the time it takes.
+//! `coseg-bench labels` measures accuracy on meshes with known parts, and time.
 
 use crate::error::{BenchError, Outcome};
 use crate::print::{print_line, table};
@@ -6,6 +6,7 @@ use crate::session::{Session, log_warnings};
 use crate::stream::{Category, Run};
 use crate::{Global, stream};
 use clap::Args;
+use coseg::ipc::convert::parse_up;
 use coseg::ipc::wire;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
@@ -14,29 +15,41 @@ use std::path::PathBuf;
 /// `coseg-bench labels`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchLabels {
-    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with one integer a face
+    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with
+    /// one integer for each face
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
     /// Only these categories [default: all]
     #[arg(long, value_name = "NAME")]
     category: Vec<String>,
-    /// Orders of arrival: the first is that of the names, others are shuffled
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    /// Number of orders of arrival: the first is that of the names, others are shuffled
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 3,
+        value_parser = clap::value_parser!(u32).range(1..=100)
+    )]
     orders: u32,
-    /// At most this many shapes of each category, the first by name
+    /// Maximum number of shapes of each category, the first by name
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     limit: Option<u32>,
     /// The axis that points up in every file [default: unknown]
-    #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
+    #[arg(long, value_name = "AXIS", value_parser = parse_up, allow_hyphen_values = true)]
     up: Option<wire::Up>,
     /// Let the daemon estimate the number of part kinds
     #[arg(long)]
     estimate: bool,
-    /// After the stream, give the shapes that the daemon suggests their true labels, and score the others by label id once
-    /// as many are labelled as each of these numbers says, such as 0,1,3,5 (0: the stream itself, which is always scored)
-    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=100))]
+    /// After the stream, give the shapes that the daemon suggests their true labels, and score the
+    /// others by label id after each of these numbers of labelled shapes, such as 0,1,3,5 (0: the
+    /// stream itself, which is always scored)
+    #[arg(
+        long,
+        value_name = "N,...",
+        value_delimiter = ',',
+        value_parser = clap::value_parser!(u32).range(..=100)
+    )]
     exemplars: Vec<u32>,
-    /// Only stream: no batch answer, no baselines (which see 60 shapes at most, spread evenly)
+    /// Only stream: no batch run, no baselines (which use at most 60 evenly spread shapes)
     #[arg(long)]
     no_baselines: bool,
     /// Write the labels of the last order to DIR/CATEGORY/NAME.labels.txt
@@ -44,7 +57,7 @@ pub(crate) struct BenchLabels {
     out: Option<PathBuf>,
 }
 
-/// Shapes at the beginning and at the end of a stream whose times are compared.
+/// Number of shapes at the beginning and at the end of a stream whose times are compared.
 const N_TIMED: usize = 50;
 
 /// Accuracies of one category.
@@ -81,18 +94,19 @@ impl Row {
             .collect()
     }
 
-    /// Orders in which as many labels are in use as there are parts.
+    /// Number of orders in which as many labels are in use as there are parts.
     fn n_right(&self) -> usize {
         let right = |r: &&Run| r.n_labels == self.n_parts;
         self.runs.iter().filter(right).count()
     }
 
-    /// Milliseconds that placing a shape took.
+    /// Mean time of placing a shape in milliseconds.
     fn place_ms(&self) -> f64 {
         mean(self.runs.iter().flat_map(|r| &r.place_ms).copied())
     }
 
-    /// What placing the last fifty shapes took over what the first fifty took; `None` with fewer than a hundred.
+    /// The ratio of the times of placing the last and the first fifty shapes; `None` with fewer
+    /// than a hundred.
     fn place_growth(&self) -> Option<f64> {
         let of = |r: &Run| {
             let n = r.place_ms.len();
@@ -171,7 +185,8 @@ fn counts(args: &BenchLabels) -> BTreeSet<usize> {
     counts.filter(|n| *n > 0).collect()
 }
 
-/// How many shapes are labelled by hand, ascending; at least one must be left over to be scored.
+/// Numbers of shapes that are labelled by hand, ascending; at least one shape must remain to be
+/// scored.
 fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, BenchError> {
     let counts = counts(args);
     let n_shapes = category.shapes.len();
@@ -184,30 +199,11 @@ fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, Benc
     }
 }
 
-/// The axis as `coseg add --up` takes it.
-fn up(text: &str) -> Result<wire::Up, String> {
-    Ok(match text.to_ascii_lowercase().as_str() {
-        "+x" | "x" => wire::Up::PlusX,
-        "-x" => wire::Up::MinusX,
-        "+y" | "y" => wire::Up::PlusY,
-        "-y" => wire::Up::MinusY,
-        "+z" | "z" => wire::Up::PlusZ,
-        "-z" => wire::Up::MinusZ,
-        "unknown" => wire::Up::Unknown,
-        "auto" => wire::Up::Auto,
-        _ => {
-            return Err(format!(
-                "{text:?} is none of +x -x +y -y +z -z unknown auto"
-            ));
-        }
-    })
-}
-
 fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count().max(1) as f64
 }
 
-/// The greatest value less the least.
+/// The largest value minus the smallest.
 fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
     let most = values.clone().fold(f64::NEG_INFINITY, f64::max);
     most - values.fold(f64::INFINITY, f64::min)

@@ -1,4 +1,5 @@
-//! Pairs of which one shape lacks a part, has a component more, or a handle: made from meshes whose correspondence is known.
+//! Measures pairs of meshes of which one lacks a part, or has an additional component or handle.
+//! They are derived from meshes with known correspondence.
 
 use crate::error::BenchError;
 use crate::maps::{Meshed, Score, load_mesh, meshed, numbers, scored};
@@ -6,17 +7,17 @@ use coseg::fmap::{EstimateOptions, PointMap};
 use coseg::mesh::{EdgeGraph, FaceGeometry, TriMesh};
 use std::path::PathBuf;
 
-/// Share of the area that is cut away, and of the component that is added.
+/// Share of the area that is cut off, and of the added component.
 const SHARE: f64 = 0.1;
 
-/// What is done to one of the shapes.
+/// The change of one of the shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Change {
-    /// An extremity of the first is cut away.
+    /// An extremity of the first shape is cut off.
     Cut,
-    /// A sphere lies beside the second.
+    /// A sphere is added beside the second shape.
     Component,
-    /// The second has a handle more.
+    /// A handle is added to the second shape.
     Handle,
 }
 
@@ -28,7 +29,7 @@ impl Change {
     ];
 }
 
-/// Vertices, over all maps: to which nothing corresponds, of which that was said, and both; and all of them.
+/// Numbers of vertices, over all maps: without counterpart, reported as such, and both; and all.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Masked {
     pub(crate) missing: usize,
@@ -38,7 +39,8 @@ pub(crate) struct Masked {
 }
 
 impl Masked {
-    /// Precision and recall of saying that nothing corresponds, and share of vertices of which it is said.
+    /// Precision and recall of reporting vertices without counterpart, and the share of reported
+    /// vertices.
     pub(crate) fn figures(&self) -> [f64; 3] {
         let share = |a: usize, b: usize| a as f64 / b.max(1) as f64;
         [
@@ -49,7 +51,7 @@ impl Masked {
     }
 }
 
-/// Errors on what both shapes have, and how well it is known what one has not.
+/// Errors on the common parts of both shapes, and the accuracy of reporting the other parts.
 pub(crate) fn bench(
     files: &[PathBuf],
     change: Change,
@@ -68,7 +70,7 @@ pub(crate) fn bench(
         let (mut at_1, mut at_2) = (points(i)?, points(j)?);
         let mut turned = mirrored(j)?.unwrap_or_default();
         let (whole_1, whole_2) = (load_mesh(&files[i])?, load_mesh(&files[j])?);
-        // For each vertex of the second whether nothing corresponds, where that is known.
+        // For each vertex of the second shape whether it lacks a counterpart, if that is known.
         let mut missing: Vec<Option<bool>> = vec![None; whole_2.vertices.len()];
         at_2.iter().for_each(|v| missing[*v as usize] = Some(false));
         let (one, two): (Meshed, Meshed) = match change {
@@ -112,7 +114,8 @@ fn count(masked: &mut Masked, map: &PointMap, missing: &[Option<bool>]) {
     }
 }
 
-/// The mesh without the vertices around the one that is farthest from the rest, and the new number of each vertex.
+/// The mesh without the vertices around the one that is farthest from the rest, and the new number
+/// of each vertex.
 fn cut(mesh: &TriMesh) -> (TriMesh, Vec<Option<u32>>) {
     let graph = EdgeGraph::new(mesh, &[]);
     let farthest = |from: u32| {
@@ -204,7 +207,7 @@ fn with_sphere(mesh: &TriMesh) -> TriMesh {
     more
 }
 
-/// The mesh with a tube of three faces' width between two far triangles.
+/// The mesh with a tube, three faces wide, between two distant triangles.
 fn with_handle(mesh: &TriMesh) -> TriMesh {
     let graph = EdgeGraph::new(mesh, &[]);
     let distance = graph.dijkstra(0);
@@ -217,7 +220,7 @@ fn with_handle(mesh: &TriMesh) -> TriMesh {
         .filter(|(f, _)| *f != a && *f != b)
         .map(|x| *x.1)
         .collect();
-    // The second triangle turns the other way as seen along the tube.
+    // Seen along the tube, the second triangle has the opposite orientation.
     for [(x, y), (z, w)] in [[(p, q), (s, u)], [(q, r), (u, t)], [(r, p), (t, s)]] {
         faces.push([x, y, z]);
         faces.push([y, w, z]);

@@ -1,4 +1,4 @@
-//! `coseg-bench`: measures labels and maps against known ones, and times the kernels.
+//! `coseg-bench` compares labels and maps with known ones, and measures time.
 
 mod carry;
 mod error;
@@ -16,14 +16,14 @@ use error::Outcome;
 use std::process::ExitCode;
 use std::time::Duration;
 
-/// The allocator of the daemon, so that both are measured alike.
+/// The allocator of the daemon, so that both are measured under equal conditions.
 #[global_allocator]
 static ALLOCATOR: tikv_jemallocator::Jemalloc = tikv_jemallocator::Jemalloc;
 
-/// Exit code of a wrong command line, as of `coseg`.
+/// Exit code of an invalid command line, as in `coseg`.
 const USAGE: u8 = 2;
 
-/// Measures how good coseg's labels and maps are, and how fast.
+/// Measures the accuracy and the speed of coseg's labels and maps.
 #[derive(Debug, Parser)]
 #[command(name = "coseg-bench", version, arg_required_else_help = true)]
 struct Cli {
@@ -36,17 +36,17 @@ struct Cli {
 /// Flags of every measurement.
 #[derive(Debug, Clone, Args)]
 struct Global {
-    /// Seconds to wait for an answer of the bench's own daemon; at least 120 are waited
+    /// Seconds to wait for an answer of the bench's own daemon; at least 120
     #[arg(long, global = true, value_name = "SECONDS", default_value_t = 120,
           value_parser = clap::value_parser!(u64).range(1..=86_400))]
     timeout: u64,
-    /// Print JSON, and nothing else, on stdout
+    /// Print only JSON on stdout
     #[arg(long, global = true)]
     json: bool,
 }
 
 impl Global {
-    /// How long an answer is waited for: other work may share the machine.
+    /// Time limit for an answer; it is generous because other work may share the machine.
     fn patience(&self) -> Duration {
         Duration::from_secs(self.timeout.max(120))
     }
@@ -58,7 +58,7 @@ enum Bench {
     Labels(labels::BenchLabels),
     /// Map meshes with known correspondence to each other, and compare
     Maps(maps::BenchMaps),
-    /// Time signatures of points, beside a copy of the eigenvectors they come from
+    /// Time the signatures of points, in comparison with copying the eigenvectors
     Signatures(signatures::BenchSignatures),
     /// The bench's own daemon starts this program again for each of its workers
     #[command(hide = true)]

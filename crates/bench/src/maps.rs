@@ -1,4 +1,5 @@
-//! `coseg-bench maps`: how good maps between points are on meshes whose correspondence is known.
+//! `coseg-bench maps` measures the accuracy of maps between points on meshes with known
+//! correspondence.
 
 use crate::error::{BenchError, Outcome};
 use crate::made::{self, Change};
@@ -15,47 +16,54 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Eigenpairs of each mesh.
+/// Number of eigenpairs of each mesh.
 const K: usize = 100;
-/// Points of each mesh at which errors are taken, spread evenly over those that are known.
+/// Number of points of each mesh at which errors are measured, evenly spread over the known ones.
 const MAX_POINTS: usize = 500;
 
 /// `coseg-bench maps`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchMaps {
-    /// Folder with folders of meshes: NAME.off, and NAME.vts, whose line i is the number, from 1, of the vertex at point i;
-    /// perhaps NAME.sym.vts, where that point lies mirrored. Meshes whose names begin with the same letters make a set
+    /// Folder with folders of meshes: NAME.off, and NAME.vts, whose line i is the number, from 1,
+    /// of the vertex at point i; optionally NAME.sym.vts with the mirrored positions of the points.
+    /// Meshes whose names begin with the same letters form a set
     #[arg(long, value_name = "DIR", required_unless_present_any = ["labels", "pair"])]
     data: Option<PathBuf>,
-    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with one integer a face. Measures
-    /// how well maps carry labels, in the place of points
+    /// Folder with a folder of meshes for each category: NAME.off or .obj, and NAME.labels.txt with
+    /// one integer for each face. Measures how well maps transfer labels, instead of points
     #[arg(long, value_name = "DIR", conflicts_with_all = ["data", "pair"])]
     labels: Option<PathBuf>,
     /// With --labels: only these categories [default: all]
     #[arg(long, value_name = "NAME", requires = "labels")]
     category: Vec<String>,
-    /// Two meshes and a file that has, for each vertex of the second, the number of a vertex of the first, from 0
+    /// Two meshes and a file with, for each vertex of the second, the number of a vertex of the
+    /// first, from 0
     #[arg(long, num_args = 3, value_names = ["FROM.off", "TO.off", "TRUTH"])]
     pair: Option<Vec<PathBuf>>,
     /// Only every Nth pair
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 1,
+        value_parser = clap::value_parser!(u32).range(1..)
+    )]
     stride: u32,
-    /// Of the pairs of --data, change one shape: cut a part away, add a component, add a handle
+    /// Of the pairs of --data, change one shape: cut off a part, add a component, add a handle
     #[arg(long, requires = "data")]
     made: bool,
 }
 
-/// A mesh with its spectrum, and the graph that measures distances on it.
+/// A mesh with its spectrum, and the graph for measuring distances on it.
 pub(crate) struct Meshed {
     spectral: SpectralMesh,
     graph: EdgeGraph,
 }
 
-/// Vertices at the known points of a mesh, and where these lie mirrored.
+/// Vertices at the known points of a mesh, and at their mirrored positions.
 pub(crate) struct Known {
     at: Vec<u32>,
     mirrored: Vec<u32>,
-    /// Distances from the points at which errors are taken, with which points these are.
+    /// Distances from the points at which errors are measured, with the indices of these points.
     distances: Vec<(usize, Vec<f64>)>,
 }
 
@@ -65,7 +73,7 @@ pub(crate) struct Score {
     forgiven: f64,
     expected: f64,
     estimate_ms: f64,
-    /// Of samples and probe functions, a shape.
+    /// Time of the samples and probe functions of a shape.
     frame_ms: f64,
 }
 
@@ -101,7 +109,12 @@ pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
     if global.json {
         let sets: Vec<_> = rows
             .iter()
-            .map(|(set, m)| json!({"set": set, "pairs": m.0, "counted": m.1, "forgiven": m.2, "estimate_ms": m.3, "frame_ms": m.4}))
+            .map(|(set, m)| {
+                json!({
+                    "set": set, "pairs": m.0, "counted": m.1, "forgiven": m.2,
+                    "estimate_ms": m.3, "frame_ms": m.4,
+                })
+            })
             .collect();
         let bins: Vec<_> = calibration
             .iter()
@@ -176,7 +189,7 @@ fn made(sets: &BTreeMap<String, Vec<PathBuf>>, stride: usize, global: &Global) -
     Ok(true)
 }
 
-/// Pairs, mean error, mean forgiven error, mean time.
+/// Number of pairs, mean error, mean error up to reflection, mean times.
 fn mean(scores: &[Score]) -> (usize, f64, f64, f64, f64) {
     let over =
         |f: &dyn Fn(&Score) -> f64| scores.iter().map(f).sum::<f64>() / scores.len().max(1) as f64;
@@ -189,7 +202,7 @@ fn mean(scores: &[Score]) -> (usize, f64, f64, f64, f64) {
     )
 }
 
-/// Quintiles of the expected error: maps, mean expected and mean actual error.
+/// Quintiles of the expected error: number of maps, mean expected and mean actual error.
 fn calibration(scores: &mut [Score]) -> Vec<(usize, f64, f64)> {
     scores.sort_by(|a, b| a.expected.total_cmp(&b.expected));
     let size = scores.len().div_ceil(5).max(1);
@@ -291,7 +304,7 @@ impl Meshed {
         self.spectral.point_shape(options)
     }
 
-    /// Distances from points spread evenly over `at`.
+    /// Distances from points that are evenly spread over `at`.
     pub(crate) fn known(&self, at: Vec<u32>, mirrored: Vec<u32>) -> Known {
         let count = at.len().min(MAX_POINTS);
         let points = (0..count).map(|i| i * at.len() / count);
@@ -351,7 +364,7 @@ fn options() -> EstimateOptions {
     }
 }
 
-/// All ordered pairs of a set, or every so many of them.
+/// All ordered pairs of a set, or every `stride`th of them.
 fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, BenchError> {
     let options = options();
     let mut meshes = Vec::new();
@@ -379,7 +392,7 @@ fn bench_set(files: &[PathBuf], stride: usize) -> Result<Vec<Score>, BenchError>
     Ok(scores.collect())
 }
 
-/// A pair of which every vertex of the second is known on the first.
+/// A pair of meshes with known correspondence for each vertex of the second.
 fn bench_pair(from: &Path, to: &Path, truth: &Path) -> Result<Score, BenchError> {
     let options = options();
     let (one, two) = (load(from)?, load(to)?);

@@ -1,4 +1,5 @@
-//! Whether maps know where nothing corresponds: labels are carried from shapes of which a part was cut away.
+//! Measures whether maps recognise missing parts: labels are transferred from shapes that lack a
+//! part.
 
 use crate::carry::{Labelled, Ready, labelled};
 use crate::error::BenchError;
@@ -10,24 +11,25 @@ use coseg::pipeline::{Params, Prepared, describe, map};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-/// Every so many shapes one has a part cut away,
+/// One of this many shapes has a part cut off
 const STRIDE: usize = 4;
-/// and is mapped to so many others.
+/// and is mapped to this many others.
 const N_TARGETS: usize = 3;
-/// Share of the area that may be cut away.
+/// Share of the area that may be cut off.
 const SHARE: std::ops::Range<f64> = 0.04..0.5;
 
-/// Areas, over maps from shapes with a part cut away (`cut`) and from the same shapes whole (`whole`).
+/// Areas, over maps from shapes with a part cut off (`cut`) and from the same shapes whole
+/// (`whole`).
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Mask {
     n_maps: usize,
-    /// To which nothing corresponds, and it was said.
+    /// Area without counterpart that is reported as such.
     found: f64,
-    /// To which nothing corresponds.
+    /// Area without counterpart.
     missing: f64,
-    /// Of which it was said.
+    /// Area that is reported as without counterpart.
     said: f64,
-    /// Of which it was said though nothing was cut away.
+    /// Area that is reported as such although nothing was cut off.
     said_of_whole: f64,
 }
 
@@ -62,13 +64,15 @@ impl Mask {
     pub(crate) fn text(&self) -> String {
         let [missing, precision, recall, of_whole] = self.figures();
         format!(
-            "{} maps from shapes with a part cut away, {missing:.3} of the target: nothing corresponds with precision {precision:.2}, recall {recall:.2}; said of {of_whole:.4} when nothing is cut away",
+            "{} maps from shapes with a part cut away, {missing:.3} of the target: nothing \
+             corresponds with precision {precision:.2}, recall {recall:.2}; said of {of_whole:.4} \
+             when nothing is cut away",
             self.n_maps
         )
     }
 }
 
-/// A shape without one of its parts, and which.
+/// A shape without one of its parts, and the index of that part.
 fn without_part(shape: &Known, kinds: &[i32], turn: usize) -> Option<(TriMesh, Vec<i32>, u32)> {
     let areas = FaceGeometry::new(&shape.mesh).areas;
     let total: f64 = areas.iter().sum();
@@ -97,7 +101,7 @@ fn without_part(shape: &Known, kinds: &[i32], turn: usize) -> Option<(TriMesh, V
     ))
 }
 
-/// Maps from shapes of which one part was cut away to others that have it.
+/// Maps from shapes with one part cut off to others that have it.
 pub(crate) fn cut_away(category: &Category, prep: &Ready) -> Result<Mask, BenchError> {
     let n = category.shapes.len();
     let masks: Vec<Mask> = (0..n)
@@ -113,7 +117,7 @@ pub(crate) fn cut_away(category: &Category, prep: &Ready) -> Result<Mask, BenchE
             let text = off(&mesh);
             let found = describe(text.as_bytes(), Format::Off, &Params::default(), &|_| true);
             let Ok(description) = found else {
-                // What is left is no surface.
+                // The rest is not a surface.
                 return Ok(Mask::default());
             };
             let cut = labelled(description, &truth, &prep.kinds);

@@ -1,4 +1,4 @@
-//! A daemon on an empty library in a temporary folder, and a client of its one collection.
+//! Runs a daemon on an empty library in a temporary folder, and a client of its only collection.
 
 use crate::error::BenchError;
 use coseg::call;
@@ -13,9 +13,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 use tracing_subscriber::EnvFilter;
 
-/// Name of the one collection.
+/// Name of the only collection.
 pub(crate) const COLLECTION: &str = "bench";
-/// How long the daemon may take to end.
+/// Time limit for the end of the daemon.
 const DRAIN_LIMIT: Duration = Duration::from_secs(30);
 /// Milliseconds that the daemon may wait before it answers that nothing has changed.
 const WAIT_MS: u64 = 1_000;
@@ -25,7 +25,7 @@ pub(crate) fn log_warnings() {
     let lines = tracing_subscriber::fmt()
         .with_env_filter(EnvFilter::new("warn"))
         .with_writer(std::io::stderr);
-    // An error means that a logger is there already.
+    // An error means that a logger exists already.
     let _ = lines.try_init();
 }
 
@@ -33,15 +33,15 @@ pub(crate) fn log_warnings() {
 pub(crate) struct Session {
     pub(crate) client: Client,
     running: Option<Running>,
-    // Last: the daemon has files there.
+    // The last field, because the daemon has files there.
     folder: tempfile::TempDir,
 }
 
 impl Session {
-    /// Starts the daemon; each answer is waited for `patience`.
+    /// Starts the daemon; `patience` is the time limit for each answer.
     pub(crate) fn start(patience: Duration) -> Result<Self, BenchError> {
         let temporary = std::env::temp_dir();
-        // The daemon's socket is in it: nobody else may enter.
+        // It contains the daemon's socket, so others must not enter it.
         let folder = tempfile::Builder::new()
             .prefix("coseg-bench-")
             .permissions(Permissions::from_mode(0o700))
@@ -67,7 +67,7 @@ impl Session {
         self.folder.path().join("library")
     }
 
-    /// Waits until the collection has nothing left to do.
+    /// Waits until the collection has no work left.
     pub(crate) fn wait_until_idle(&mut self) -> Result<(), BenchError> {
         loop {
             let request = wire::WaitIdleRequest {
@@ -80,7 +80,7 @@ impl Session {
         }
     }
 
-    /// The job once it is finished.
+    /// Waits for the end of a job and returns it.
     pub(crate) fn finished(&mut self, job_id: u64) -> Result<wire::Job, BenchError> {
         let mut revision = 0;
         loop {

@@ -1,4 +1,5 @@
-//! `coseg-bench signatures`: how fast signatures are computed from eigenvectors, beside a plain copy of them.
+//! `coseg-bench signatures` measures how fast signatures are computed from eigenvectors, in
+//! comparison with copying them.
 
 use crate::Global;
 use crate::error::Outcome;
@@ -11,26 +12,46 @@ use std::time::Instant;
 /// `coseg-bench signatures`
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchSignatures {
-    /// Vertices
-    #[arg(long, value_name = "N", default_value_t = 40_000, value_parser = clap::value_parser!(u32).range(48..=10_000_000))]
+    /// Number of vertices
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 40_000,
+        value_parser = clap::value_parser!(u32).range(48..=10_000_000)
+    )]
     vertices: u32,
-    /// Eigenpairs
-    #[arg(long, value_name = "K", default_value_t = 300, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    /// Number of eigenpairs
+    #[arg(
+        long,
+        value_name = "K",
+        default_value_t = 300,
+        value_parser = clap::value_parser!(u32).range(2..=10_000)
+    )]
     k: u32,
-    /// Times of the heat kernel, and energies of the wave kernel
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    /// Number of times of the heat kernel, and of energies of the wave kernel
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 100,
+        value_parser = clap::value_parser!(u32).range(1..=1_000)
+    )]
     columns: u32,
-    /// Rounds, of which the best counts
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    /// Number of rounds, of which the best counts
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 5,
+        value_parser = clap::value_parser!(u32).range(1..=1_000)
+    )]
     rounds: u32,
 }
 
-/// Vertices whose signatures are computed together.
+/// Number of vertices whose signatures are computed together.
 const BATCH: usize = 48;
-/// Columns of the global point signature.
+/// Number of columns of the global point signature.
 const N_GPS: usize = 60;
 
-/// What one signature cost.
+/// The cost of one signature.
 struct Row {
     name: String,
     seconds: f64,
@@ -41,7 +62,7 @@ struct Row {
 pub(crate) fn run(args: &BenchSignatures, global: &Global) -> Outcome {
     let (n, k) = (args.vertices as usize, args.k as usize);
     let columns = args.columns as usize;
-    // Weyl's law, and numbers of about the right size: what they are makes no difference to the time.
+    // Weyl's law, and numbers of about the right size; their values do not affect the time.
     let area = 4.0 * std::f64::consts::PI;
     let values: Vec<f64> = (0..k).map(|i| area * i as f64).collect();
     let vectors: Vec<f64> = (0..n * k)

@@ -1,4 +1,5 @@
-//! Meshes with known parts go through a daemon's socket in some order, and through the baselines in process.
+//! Streams meshes with known parts through a daemon's socket in some order, and runs the baselines
+//! on them in process.
 
 use crate::error::BenchError;
 use crate::session::{COLLECTION, Session};
@@ -24,11 +25,12 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// What lies beside a mesh and holds its true labels.
+/// Suffix of the file with the true labels, beside the mesh.
 const TRUTH: &str = ".labels.txt";
-/// The stages after a shape is described.
+/// The stages after the description of a shape.
 const PLACING: [&str; 4] = ["store", "place", "recluster", "boundary"];
-/// Most shapes that are labelled at once in process: the cost grows with the square.
+/// Maximum number of shapes that are labelled together in process, since the cost grows with the
+/// square.
 const MAX_TOGETHER: usize = 60;
 
 /// Meshes of one kind, with their true labels.
@@ -47,7 +49,7 @@ pub(crate) struct Known {
     pub(crate) truth: Vec<i32>,
 }
 
-/// What came of one order of arrival.
+/// The result of one order of arrival.
 pub(crate) struct Run {
     pub(crate) accuracy: f64,
     pub(crate) purity: f64,
@@ -55,9 +57,10 @@ pub(crate) struct Run {
     pub(crate) n_labels: usize,
     pub(crate) n_missing: usize,
     pub(crate) seconds: f64,
-    /// Milliseconds that placing each shape took, in the order of arrival: all that comes after its description.
+    /// Time of placing each shape in milliseconds, in the order of arrival: everything after its
+    /// description.
     pub(crate) place_ms: Vec<f64>,
-    /// Accuracy of the others after some shapes were labelled by hand, for each number of them that was asked for.
+    /// Accuracy of the other shapes, for each requested number of shapes labelled by hand.
     pub(crate) with_exemplars: Vec<f64>,
     labels: Vec<Option<Vec<i32>>>,
 }
@@ -80,7 +83,7 @@ fn is_truth(path: &Path) -> bool {
     path.to_string_lossy().ends_with(TRUTH)
 }
 
-/// The categories below a folder, by name; the folder itself, if it holds labels.
+/// The categories below a folder, by name; the folder itself, if it contains labels.
 pub(crate) fn categories(
     data: &Path,
     wanted: &[String],
@@ -191,7 +194,8 @@ fn arrival(n: usize, order: u32) -> Vec<usize> {
     at
 }
 
-/// Sends a category shape by shape, each when the one before it is labelled, and scores what is there in the end.
+/// Sends a category shape by shape, each when the previous one is labelled, and scores the final
+/// labels.
 pub(crate) fn stream(
     category: &Category,
     order: u32,
@@ -245,7 +249,7 @@ pub(crate) fn stream(
     })
 }
 
-/// The labels of all shapes once nothing is waiting; `None` for a shape that is not there.
+/// The labels of all shapes once no work is left; `None` for a missing shape.
 fn labels_now(
     category: &Category,
     session: &mut Session,
@@ -263,8 +267,9 @@ fn labels_now(
     Ok(labels)
 }
 
-/// A person labels the shapes that the daemon suggests, one by one, until as many are labelled as `counts` says: for each
-/// of these (ascending) the accuracy of the other shapes, labels compared by id.
+/// Labels the shapes that the daemon suggests, one by one, like a person, until `counts` shapes are
+/// labelled. Returns for each count (ascending) the accuracy of the other shapes, with labels
+/// compared by id.
 pub(crate) fn with_exemplars(
     category: &Category,
     counts: &[usize],
@@ -319,7 +324,7 @@ pub(crate) fn with_exemplars(
     Ok(accuracies)
 }
 
-/// Milliseconds that placing each shape of a job took, once the job is finished.
+/// Time of placing each shape of a finished job in milliseconds.
 fn placing_ms(job: wire::Job) -> Vec<f64> {
     let of_shape = |item: wire::JobItem| {
         let stages = item.placed.unwrap_or_default().stages.into_iter();
@@ -329,7 +334,7 @@ fn placing_ms(job: wire::Job) -> Vec<f64> {
     job.items.into_iter().map(of_shape).collect()
 }
 
-/// Writes the labels of a run, one file a shape.
+/// Writes the labels of a run, one file for each shape.
 pub(crate) fn write(category: &Category, run: &Run, out: &Path) -> Result<(), BenchError> {
     std::fs::create_dir_all(out).map_err(|e| BenchError::file(out, e))?;
     for (shape, labels) in category.shapes.iter().zip(&run.labels) {
@@ -340,8 +345,9 @@ pub(crate) fn write(category: &Category, run: &Run, out: &Path) -> Result<(), Be
     Ok(())
 }
 
-/// Accuracy of the batch answer, of streaming without maps and of the baselines, on the descriptions of a library
-/// that a daemon has left. Labels go from the proxy to the faces of the input without refined boundaries.
+/// Accuracy of the batch run, of streaming without maps and of the baselines, on the descriptions
+/// in a library of an ended daemon. Labels are extended from the proxy to the faces of the input
+/// without refined boundaries.
 pub(crate) fn others(
     category: &Category,
     library: &Path,
@@ -390,7 +396,8 @@ pub(crate) fn others(
     Ok(out)
 }
 
-/// Streaming as the daemon does it, in the order given, but each shape labelled by the label model alone.
+/// Streaming like the daemon's, in the given order, but with each shape labelled by the label model
+/// alone.
 fn without_maps(views: &[DescriptionView<'_>], k: usize, up: Option<[f64; 3]>) -> Vec<Vec<u32>> {
     let mut model = None;
     let mut labels: Vec<Vec<u32>> = Vec::new();

@@ -1,4 +1,4 @@
-//! The figures of `coseg-bench labels`, on shapes that are made here.
+//! Tests the figures of `coseg-bench labels` on generated shapes.
 
 use coseg::mesh::write::off;
 use coseg::synth::{Family, Options, family};

@@ -117,7 +117,8 @@ impl SpectralMesh {
     /// let (one, two) = (of(egg)?, of(turned)?);
     ///
     /// let options = EstimateOptions::default();
-    /// let maps = point_maps(&one.point_shape(&options), &two.point_shape(&options), &[], &options);
+    /// let (from, to) = (one.point_shape(&options), two.point_shape(&options));
+    /// let maps = point_maps(&from, &to, &[], &options);
     /// // For each vertex of shape 2 a vertex of shape 1.
     /// assert_eq!(maps[0].p2p_21.len(), two.mesh.vertices.len());
     /// # Ok::<_, coseg_geometry::SpectralMeshError>(())

@@ -12,6 +12,7 @@ use crate::cli::Render;
 use canvas::{Canvas, GLYPH};
 use coseg::ipc::wire::{self, LabelInfo};
 use coseg::mesh::ParsedMesh;
+use coseg::text::counted;
 use serde_json::json;
 use view::View;
 
@@ -72,7 +73,8 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
             "n_shapes": shapes.len(),
         }))?;
     } else {
-        eprintln!("{} shapes drawn to {}", shapes.len(), args.out.display());
+        let shapes = counted(shapes.len() as u64, "shape");
+        eprintln!("{shapes} drawn to {}", args.out.display());
     }
     Ok(true)
 }

@@ -54,7 +54,7 @@ fn up_of(value: i32, field: &str) -> Result<Option<Up>, wire::Error> {
 /// The new up axis of a collection.
 pub fn new_up(request: &wire::UpdateCollectionRequest) -> Result<Up, wire::Error> {
     let missing = || {
-        let text = "up is missing; it is what can be changed";
+        let text = "up is missing; no other setting can be changed";
         field_error(wire::ErrorReason::FieldMissing, "up", text)
     };
     up_of(request.up, "up")?.ok_or_else(missing)
@@ -126,8 +126,8 @@ pub fn collection_differs(
     None
 }
 
-/// The name of an axis for people: `+y`, `unknown`, `auto`.
-fn up_name(up: wire::Up) -> &'static str {
+/// The name of an axis on the command line and in messages: `+y`, `unknown`, `auto`.
+pub fn up_name(up: wire::Up) -> &'static str {
     match up {
         wire::Up::PlusX => "+x",
         wire::Up::MinusX => "-x",
@@ -138,6 +138,42 @@ fn up_name(up: wire::Up) -> &'static str {
         wire::Up::Unspecified | wire::Up::Unknown => "unknown",
         wire::Up::Auto => "auto",
     }
+}
+
+/// Parses the name of an axis, in upper or lower case; `y` means `+y`.
+///
+/// ```
+/// use coseg::ipc::{convert::parse_up, wire::Up};
+///
+/// assert_eq!(parse_up("Y"), Ok(Up::PlusY));
+/// assert!(parse_up("up").is_err_and(|e| e.contains("\"up\"")));
+/// ```
+///
+/// # Errors
+/// A message with the text and the names of all axes, if the text is not one of them.
+pub fn parse_up(text: &str) -> Result<wire::Up, String> {
+    const AXES: [wire::Up; 8] = [
+        wire::Up::PlusX,
+        wire::Up::MinusX,
+        wire::Up::PlusY,
+        wire::Up::MinusY,
+        wire::Up::PlusZ,
+        wire::Up::MinusZ,
+        wire::Up::Unknown,
+        wire::Up::Auto,
+    ];
+    let lower = text.to_ascii_lowercase();
+    let is_meant = |axis: &wire::Up| {
+        let name = up_name(*axis);
+        lower == name || name.strip_prefix('+') == Some(lower.as_str())
+    };
+    let found = AXES.into_iter().find(is_meant);
+    found.ok_or_else(|| {
+        format!(
+            "{text:?} is not an axis; expected one of {}",
+            AXES.map(up_name).join(" ")
+        )
+    })
 }
 
 fn operator_name(operator: wire::Operator) -> &'static str {

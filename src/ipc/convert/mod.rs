@@ -15,7 +15,8 @@ pub use analysis::{
 };
 pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
 pub use collections::{
-    collection, collection_differs, collection_spec, label_info, new_up, up_from_wire, updated,
+    collection, collection_differs, collection_spec, label_info, new_up, parse_up, up_from_wire,
+    up_name, updated,
 };
 pub use corrections::{corrected, correction, suggested, undone};
 pub use errors::{

@@ -205,7 +205,8 @@ impl Tx<'_> {
         self.execute(
             "DELETE FROM label_versions WHERE shape_id = ?1 AND version < ?2 AND NOT EXISTS (
                SELECT 1 FROM labels_before
-               WHERE labels_before.shape_id = ?1 AND labels_before.version = label_versions.version)",
+               WHERE labels_before.shape_id = ?1 AND labels_before.version = \
+               label_versions.version)",
             params![shape, oldest],
         )?;
         Ok(())

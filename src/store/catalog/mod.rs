@@ -291,7 +291,7 @@ fn bear_witness(connection: &Connection, path: &Path) -> Result<(), StoreError> 
         Found::Whole(found) => found.settled,
         Found::Missing => 0,
         Found::Damaged(what) => {
-            tracing::warn!("{what}; it is written anew from the catalog");
+            tracing::warn!("{what}; it is rewritten from the catalog");
             0
         }
     };

@@ -72,7 +72,10 @@ impl Table {
 }
 
 macro_rules! tables {
-    ($($const:ident $name:literal key $n_key:literal [$($column:literal),+ $(,)?] $definition:literal)+) => {
+    ($(
+        $const:ident $name:literal key $n_key:literal
+        [$($column:literal),+ $(,)?] $definition:literal
+    )+) => {
         $(pub(crate) const $const: Table = Table {
             name: $name,
             n_key: $n_key,
@@ -195,7 +198,8 @@ tables! {
      sum INTEGER"
 
     JOB_ITEMS "job_items" key 2 [
-        "job_id", "idx", "name", "original_digest", "format", "replace_existing", "status", "detail",
+        "job_id", "idx", "name", "original_digest", "format", "replace_existing",
+        "status", "detail",
     ]
     "job_id INTEGER NOT NULL REFERENCES jobs ON DELETE CASCADE, idx INTEGER NOT NULL,
      name TEXT NOT NULL, original_digest TEXT NOT NULL, format TEXT NOT NULL,

@@ -259,8 +259,8 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
     }
     if said.commits < promised {
         return lacks(format!(
-            "catalog.db with its log holds {} changes of {promised} that were acknowledged: the log \
-             (catalog.db-wal) is missing, was cut or is an older one",
+            "catalog.db with its log holds {} changes of {promised} that were acknowledged: the \
+             log (catalog.db-wal) is missing, was cut or is an older one",
             said.commits
         ));
     }

@@ -1,4 +1,5 @@
-//! Four-legged animals: what a dog, a cow, a giraffe and a pig have in common, standing or walking.
+//! Generates four-legged animals, standing or walking, with the common features of a dog, a cow, a
+//! giraffe and a pig.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;
@@ -31,7 +32,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         .cone(BODY, rear, belly, hips, waist)
         .cone(BODY, belly, front, waist, chest);
 
-    // Legs: the pairs stride against each other.
+    // Legs: the pairs stride in opposite directions.
     let thick = dice.between(0.8, 1.25);
     // Degrees; on a short body long legs must not stride into each other.
     let stride = dice.between(-1.0, 1.0) * (14.0 * length / leg).min(24.0);
@@ -39,8 +40,8 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         for side in [-1.0, 1.0] {
             let swing = stride * side * if is_front { 1.0 } else { -1.0 } + dice.between(-6.0, 6.0);
             // Thighs must not meet under a narrow body.
-            let apart = (0.62 * hip_radius).max(0.02 + thigh(thick, is_front));
-            let hip = [side * apart, end[1] - 0.15 * hip_radius, end[2]];
+            let offset = (0.62 * hip_radius).max(0.02 + thigh(thick, is_front));
+            let hip = [side * offset, end[1] - 0.15 * hip_radius, end[2]];
             let bend = dice.between(4.0, 28.0) * if is_front { 1.0 } else { -1.0 };
             legs(&mut scene, hip, leg, swing, bend, thick, is_front);
         }
@@ -123,12 +124,12 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     scene
 }
 
-/// Radius of a leg where it leaves the body.
+/// Radius of a leg at the body.
 fn thigh(thick: f64, is_front: bool) -> f64 {
     if is_front { 0.085 * thick } else { 0.1 * thick }
 }
 
-/// One leg, down to y = 0 for a straight one.
+/// Adds one leg; a straight one reaches down to y = 0.
 fn legs(scene: &mut Scene, hip: Vec3, leg: f64, swing: f64, bend: f64, thick: f64, is_front: bool) {
     let down = [0.0, -1.0, 0.0];
     // The joint bends forward on hind legs (a knee) and backward on front legs (an elbow).

@@ -1,4 +1,4 @@
-//! Birds: standing with folded wings, or with wings spread; short necks and long ones.
+//! Generates birds: standing with folded wings, or with wings spread; with short or long necks.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;

@@ -1,4 +1,5 @@
-//! Candelabra: a base, a stem with knobs, and one to seven candles, all but the middle one on arms.
+//! Generates candelabra: a base, a stem with knobs, and one to seven candles, of which all but the
+//! middle one are on arms.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::{Limb, Scene};
@@ -41,7 +42,8 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let rise = dice.between(-0.04, 0.12);
     let turned = dice.between(0.0, 360.0);
     for i in 0..n_arms {
-        // In a ring around the stem, or all in one plane, pair by pair, the outer pairs lower.
+        // Arms form a ring around the stem, or lie in one plane, pair by pair, with lower outer
+        // pairs.
         let (angle, far, root, level) = if ring {
             let far = reach * if n_arms > 4 { 1.1 } else { 1.0 };
             (
@@ -136,7 +138,7 @@ fn base(scene: &mut Scene, dice: &mut Dice, rod: f64) {
     }
 }
 
-/// A drip pan with a candle on it.
+/// Adds a drip pan with a candle.
 fn candle(limb: &mut Limb, at: Vec3, cup: f64, wax: f64, long: f64) {
     limb.disc(CANDLE, Frame::at(at), cup, 0.03, 0.025);
     let middle = Frame::at(along(at, UP, long / 2.0));

@@ -1,4 +1,5 @@
-//! Chairs: on four legs, a pedestal or runners; back solid, of bars or of rungs; with and without arms.
+//! Generates chairs: on four legs, a pedestal or runners; with a solid back, bars or rungs; with or
+//! without arms.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;
@@ -11,7 +12,7 @@ const BACK: u32 = 1;
 const LEG: u32 = 2;
 const ARM: u32 = 3;
 
-/// What all parts are fitted to.
+/// The dimensions to which all parts are fitted.
 struct Plan {
     /// Height of the middle of the seat.
     height: f64,
@@ -19,14 +20,14 @@ struct Plan {
     seat: Vec3,
     /// Radius of posts, bars and legs.
     rod: f64,
-    /// How far inside the seat's edges the legs must be to be under it.
+    /// Distance from the seat's edges at which the legs are under the seat.
     inset: f64,
-    /// Half width and rear edge of what a back can stand on.
+    /// Half width and rear edge of the area that can support a back.
     rear: [f64; 2],
 }
 
 impl Plan {
-    /// Where a ball of this radius must be so as not to show through the seat.
+    /// Height at which a ball of this radius does not show through the seat.
     fn under(&self, radius: f64) -> f64 {
         self.height + self.seat[1] - radius - 0.008
     }
@@ -55,7 +56,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let centre = Frame::at([0.0, plan.height, 0.0]);
     let limb = scene.limb(0.0, 0.0);
     if round {
-        // A plate lies across its third axis; turned, that is up.
+        // A plate lies across its third axis, which points up after turning.
         let frame = centre.turned(1, 2, -90.0);
         let outline = rounded(width - 0.03, depth - 0.03);
         limb.solid(
@@ -83,7 +84,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     scene
 }
 
-/// A rectangle of these half sizes whose corners are far from sharp.
+/// A rectangle of these half sizes with strongly rounded corners.
 fn rounded(x: f64, y: f64) -> Vec<[f64; 2]> {
     let c = 0.82;
     let points = [
@@ -317,7 +318,7 @@ fn arm_rests(scene: &mut Scene, dice: &mut Dice, plan: &Plan, back: &Frame) {
     let drop = dice.between(0.0, 0.03);
     let solid = dice.chance(0.25);
     for side in [-1.0, 1.0] {
-        // The rest ends in the back, wherever that is at this height.
+        // The rest ends in the back, at the back's position at this height.
         let rise = (high + drop - back.origin[1]) / back.axes[1][1];
         let rear = back.world([side * (plan.rear[0] - plan.rod), rise, 0.0]);
         let front = [side * (width + 0.005), high, reach];

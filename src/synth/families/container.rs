@@ -1,4 +1,4 @@
-//! Containers: cups, vases, jugs and goblets, hollow, with none, one or two handles.
+//! Generates containers: hollow cups, vases, jugs and goblets with up to two handles.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;
@@ -118,7 +118,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
         for i in 0..n_handles {
             let out = turn([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], turned + 180.0 * i as f64);
             let at = |r: f64, y: f64| -> Vec3 { [r * out[0], y + ground, r * out[2]] };
-            // The ends stay within the wall, so that nothing shows inside.
+            // The ends stay within the wall, so that they do not show inside.
             let shift = thick - WALL;
             let start = if from_neck {
                 neck_radius

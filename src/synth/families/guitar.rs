@@ -1,4 +1,5 @@
-//! Guitars: body, neck and head, from the classical figure of eight to arrow-shaped electric ones.
+//! Generates guitars: body, neck and head, from the classical figure of eight to arrow-shaped
+//! electric ones.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;
@@ -118,7 +119,7 @@ fn head(scene: &mut Scene, dice: &mut Dice, at: [f64; 3], half_width: f64) {
     }
 }
 
-/// The outline whose right half is given from the bottom up, in units of half the length.
+/// Mirrors an outline whose right half is given from the bottom up, in units of half the length.
 fn mirrored(length: f64, right: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let h = length / 2.0;
     let mut points: Vec<[f64; 2]> = right.iter().map(|[x, y]| [x * h, y * h]).collect();

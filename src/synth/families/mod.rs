@@ -1,7 +1,7 @@
-//! The grammars: for each family, dice become a scene of labelled primitives.
+//! Generates, for each family, a scene of labelled primitives from random choices.
 //!
-//! Everywhere +y is up; what has a front faces +z. A scene is about one unit high and no part is thinner
-//! than 0.025 in radius, so that a mesh of a few thousand faces can hold it.
+//! In every scene +y is up, and fronts face +z. A scene is about one unit high and no part is
+//! thinner than 0.025 in radius, so that a mesh of a few thousand faces can represent it.
 
 pub(super) mod animal;
 pub(super) mod bird;

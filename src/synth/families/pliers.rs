@@ -1,4 +1,5 @@
-//! Pliers: two levers crossing at a joint, jaws pointed, flat or curved, handles straight or bowed.
+//! Generates pliers: two levers that cross at a joint, with pointed, flat or curved jaws and
+//! straight or bowed handles.
 
 use crate::synth::dice::Dice;
 use crate::synth::field::Scene;
@@ -33,7 +34,7 @@ pub(in crate::synth) fn scene(dice: &mut Dice) -> Scene {
     let flare = dice.between(-0.05, 0.09);
     let grip = dice.between(0.045, 0.068);
     for side in [-1.0, 1.0] {
-        // Half of the opening each; the jaw of a lever is on the other side of its handle.
+        // Half of the opening for each lever; its jaw is on the other side of its handle.
         let lever = Frame::at([0.0; 3]).turned(0, 1, side * open);
         let at = |x: f64, y: f64| -> Vec3 { lever.world([-side * x, y, 0.0]) };
         let limb = scene.limb(0.03, 0.02);

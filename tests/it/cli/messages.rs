@@ -1,4 +1,4 @@
-//! Messages name the value, the limit and what to do.
+//! Tests that messages name the value, the limit and the remedy.
 
 use super::{home_with_folder, stderr};
 use crate::harness::{Home, coseg, json, skittle, stdout};
@@ -161,7 +161,7 @@ fn a_library_that_is_held_names_the_holder() {
         "is held by process {pid}, the daemon at {at}; `coseg stop --endpoint {at}` ends it"
     );
     assert!(stderr(&refused).contains(&holder), "{}", stderr(&refused));
-    // The same socket: so is it.
+    // The same holds for the same socket.
     let mut command = coseg();
     command.args(["serve", "--library", &library, "--endpoint", &at]);
     let refused = command.output().unwrap();
@@ -205,7 +205,7 @@ fn a_default_folder_that_others_may_enter_is_not_trusted() {
             assert!(text.contains(&said) && text.contains(&cure), "{text}");
         }
     }
-    // A service's may let a group in, but not let it put sockets there.
+    // The folder of a service may let a group in, but not let it create sockets there.
     for (mode, status) in [(0o755, 3), (0o770, 2)] {
         std::fs::set_permissions(&folder, Permissions::from_mode(mode)).unwrap();
         let output = listed("RUNTIME_DIRECTORY", &folder);
@@ -216,7 +216,7 @@ fn a_default_folder_that_others_may_enter_is_not_trusted() {
             stderr(&output)
         );
     }
-    // Nobody is at a default place that was named.
+    // No daemon listens at a default endpoint that was named.
     std::fs::set_permissions(&folder, Permissions::from_mode(0o777)).unwrap();
     let endpoint = format!("ipc://{}/coseg.sock", folder.display());
     let mut named = coseg();

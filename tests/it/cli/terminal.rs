@@ -1,4 +1,4 @@
-//! What a person at a terminal is asked and told, and what a script is not.
+//! Tests the questions and messages at a terminal, and the behaviour in a script.
 
 use super::{home_with_folder, stderr};
 use crate::harness::{Home, coseg, json, skittle, stdout};
@@ -7,7 +7,8 @@ use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::os::unix::process::ExitStatusExt as _;
 use std::process::{Command, Stdio};
 
-/// Types a command, and an answer, at a terminal that `script` makes: the status, and what is seen.
+/// Runs a command at a terminal of `script`, and types an answer; returns the status and the
+/// output.
 fn typed(home: &Home, command: &str, answer: &str) -> (Option<i32>, String) {
     let program = env!("CARGO_BIN_EXE_coseg");
     let mut child = Command::new("script")
@@ -47,7 +48,7 @@ fn what_cannot_be_undone_is_asked_at_a_terminal_and_nowhere_else() {
         seen.contains("[y/N]") && seen.contains("nothing was removed"),
         "{seen}"
     );
-    // Return alone is no.
+    // Return alone means no.
     let (status, seen) = typed(&home, "collections delete c", "\n");
     assert_eq!(status, Some(1), "{seen}");
     assert!(seen.contains("Delete c with its 3 shapes and "), "{seen}");
@@ -66,7 +67,7 @@ fn what_cannot_be_undone_is_asked_at_a_terminal_and_nowhere_else() {
     );
     assert_eq!(n_shapes(), 1);
 
-    // A script has said what it wants; what went is told all the same.
+    // A script is not asked; the message still names the removed shapes.
     let output = home.coseg(&["collections", "delete", "c"]);
     assert_eq!(stdout(&output, 0), "");
     assert!(
@@ -95,8 +96,8 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // The first is there, so its job and those sent ahead are accepted.
-    // Kept open: who closes a pipe ends the command in another way.
+    // The first shape is stored, so its job and those sent ahead are accepted.
+    // The pipe stays open, since closing it would end the command in another way.
     let mut lines = BufReader::new(child.stdout.take().unwrap());
     let mut first = String::new();
     lines.read_line(&mut first).unwrap();
@@ -128,7 +129,7 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
         .as_u64()
         .unwrap();
     assert!((1..80).contains(&n), "{n} shapes");
-    // All that is left of a collection, which is nothing now.
+    // The rest of the collection is deleted.
     let nothing = home.coseg(&["cancel", "-c", "c"]);
     assert_eq!(stdout(&nothing, 0), "");
     assert!(
@@ -147,7 +148,7 @@ fn stopping_says_what_is_waited_for_and_waits() {
     let daemon = home.start();
     let output = home.coseg(&["stop"]);
     assert_eq!(stdout(&output, 0), "");
-    let expected = "the daemon answers what was asked, then ends\nthe daemon has ended\n";
+    let expected = "the daemon answers pending requests, then ends\nthe daemon has ended\n";
     assert_eq!(stderr(&output), expected);
     assert_eq!(daemon.ended().0.code(), Some(0));
     let output = home.coseg(&["stop", "--timeout", "0.2"]);

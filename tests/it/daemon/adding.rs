@@ -1,4 +1,4 @@
-//! Shapes come in: labelled, refused, cancelled, repeated.
+//! Tests adding shapes: labelled, refused, cancelled, repeated.
 
 use super::{add_again, create, describe, events_since, raw, raw_error, wait_idle};
 use crate::harness::{Daemon, Home, SKITTLE_FACES, add, add_request, additions, skittle};
@@ -130,7 +130,7 @@ fn arrays_are_added_like_files() {
     };
     let (reply, _) = call!(client, AddShapes(request), frames.finish(), with_frames).unwrap();
     assert_eq!(reply.job.unwrap().items[0].state(), ItemState::Done);
-    // The same mesh as a file of the same digits is the same shape.
+    // The same mesh as a file with the same digits is the same shape.
     let job = add_again(client, "c", "arrays", &text);
     assert_eq!(
         job.items[0].placed.as_ref().unwrap().outcome(),
@@ -162,7 +162,7 @@ fn refused_meshes_fail_alone_and_say_where() {
         job.items[2].error.as_ref().unwrap().reason(),
         ErrorReason::Parse
     );
-    // The same bytes again are unchanged, others under the name are not taken.
+    // The same bytes again are unchanged; other bytes under the same name are refused.
     let again = add_again(client, "c", "good", &skittle(0));
     assert_eq!(
         again.items[0].placed.as_ref().unwrap().outcome(),
@@ -205,7 +205,7 @@ fn the_same_request_again_has_one_effect_and_the_same_reply_across_a_restart() {
         .filter(|e| matches!(e.kind, Some(Kind::ShapeAdded(_))))
         .count();
     assert_eq!(added, 1);
-    // The same id for another request is refused, not answered with the wrong reply.
+    // The same id for another request is refused, rather than answered with the wrong reply.
     client.set_client_id("importer");
     let (body, frames) = add_request("c", &[("b", &text)], wire::AddMode::Job);
     match client.call_as("17", body, frames) {
@@ -237,7 +237,8 @@ fn settings_that_differ_are_refused() {
     }
 }
 
-/// Sends requests one after the other without waiting; their replies as they come, each with its id.
+/// Sends requests one after the other without waiting; returns their replies in the order of
+/// arrival, with their ids.
 fn pipelined(
     endpoint: &str,
     requests: Vec<(String, request::Body, Vec<bytes::Bytes>)>,
@@ -262,7 +263,8 @@ fn pipelined(
         .collect()
 }
 
-/// A request that creates the collection "c", and one that adds a file so large that those behind it wait for their turn.
+/// A request that creates the collection "c", and one with a file so large that later requests wait
+/// for their turn.
 fn before_the_others() -> Vec<(String, request::Body, Vec<bytes::Bytes>)> {
     let spec = wire::CollectionSpec {
         name: "c".to_owned(),
@@ -288,7 +290,8 @@ fn adding(
     (id.to_owned(), request::Body::AddShapes(request), frames)
 }
 
-/// Files are written side by side, so that a small one is there before a large one that was sent earlier.
+/// Files are written concurrently, so a small one is stored before a large one that was sent
+/// earlier.
 #[test]
 fn what_one_client_sends_takes_effect_in_its_order() {
     let home = Home::new();
@@ -311,7 +314,7 @@ fn what_one_client_sends_takes_effect_in_its_order() {
     assert_eq!(order, ["0", "1", "2", "3", "4", "5", "6", "7"]);
 }
 
-/// Those who wait for their turn together are accepted in one transaction.
+/// Requests that wait for their turn together are accepted in one transaction.
 #[test]
 fn who_is_refused_among_others_is_refused_alone() {
     let home = Home::new();
@@ -322,7 +325,7 @@ fn who_is_refused_among_others_is_refused_alone() {
         adding("nowhere", "d", "s2", &skittle(2)),
         // Another request under an id that was used.
         adding("1", "c", "s3", &skittle(3)),
-        // Twice the same.
+        // The same request twice.
         adding("4", "c", "s4", &skittle(4)),
         adding("4", "c", "s4", &skittle(4)),
     ]);
@@ -394,7 +397,8 @@ fn a_deadline_ends_the_wait_and_not_the_work() {
     );
     let client = &mut daemon.client();
     let Some(Subject::JobId(job_id)) = error.subject else {
-        // Late before it was begun, it has no effect; else it goes on behind the answer.
+        // If the deadline passes before the change begins, it has no effect; otherwise it continues
+        // after the reply.
         for _ in 0..200 {
             let Ok((reply::Result::DescribeCollection(found), _)) =
                 client.call(describe("c"), Vec::new())
@@ -462,13 +466,14 @@ fn a_full_queue_is_said_with_a_delay() {
         client.call(body, frames)
     };
     send(&["a", "b"]).unwrap();
-    // Two shapes are not described and placed in the time that the next request takes.
+    // Two shapes cannot be described and placed in the time of the next request.
     match send(&["c", "d"]) {
         Err(ClientError::Refused(e)) => {
             assert_eq!(e.code(), ErrorCode::ResourceExhausted);
             assert_eq!(e.reason(), ErrorReason::QueueFull);
             assert!(e.retry_after_ms > 0);
-            let end = "shapes are queued and 2 shapes more asked for, the limit is 2 shapes (limits.max_queued_shapes)";
+            let end = "shapes are queued and 2 shapes more asked for, the limit is 2 shapes \
+                       (limits.max_queued_shapes)";
             assert!(e.message.ends_with(end), "{}", e.message);
         }
         other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),
@@ -476,7 +481,8 @@ fn a_full_queue_is_said_with_a_delay() {
     match send(&["e", "f", "g"]) {
         Err(ClientError::Refused(e)) => {
             assert_eq!(e.code(), ErrorCode::InvalidArgument);
-            let text = "the request has 3 shapes, the whole queue holds 2 shapes (limits.max_queued_shapes)";
+            let text = "the request has 3 shapes, the whole queue holds 2 shapes \
+                        (limits.max_queued_shapes)";
             assert_eq!(e.message, text);
         }
         other => panic!("unexpected: {:?}", other.map(|(r, _)| r)),

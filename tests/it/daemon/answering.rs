@@ -1,4 +1,5 @@
-//! What is computed for a request, or changed by one, costs that request at most: the daemon goes on, and says why.
+//! Tests that a computation or a change costs at most its request: the daemon continues, and
+//! reports the reason.
 
 use super::{create_with, raw};
 use crate::harness::{Daemon, Home, add, skittle, wait_idle};
@@ -20,7 +21,7 @@ fn c() -> String {
     "c".to_owned()
 }
 
-/// Sends a request of its own making, and gives the answer.
+/// Sends a raw request and returns the reply.
 fn ask(endpoint: &str, request: &wire::Request) -> Result<reply::Result, wire::Error> {
     let dealer = raw(zmq::DEALER, endpoint);
     dealer.send(request.encode_to_vec(), 0).unwrap();
@@ -40,7 +41,7 @@ fn asked(body: Body, deadline_ms: u64) -> wire::Request {
     }
 }
 
-/// A map that is not kept, for nobody has asked for one of that size.
+/// A map of this size is not stored, since none was requested before.
 fn map(from: &str, k: u32) -> Body {
     Body::GetFunctionalMap(wire::GetFunctionalMapRequest {
         collection: c(),
@@ -63,7 +64,7 @@ fn correction(shape: &str) -> Body {
     })
 }
 
-/// Processes that the daemon has started and not ended.
+/// Running child processes of the daemon.
 fn n_workers(daemon: &Daemon) -> usize {
     let parent = format!("PPid:\t{}", daemon.child.id());
     let status = |entry: std::fs::DirEntry| std::fs::read_to_string(entry.path().join("status"));
@@ -92,7 +93,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
     assert!(job.items.iter().all(|i| i.error.is_none()), "{job:?}");
     wait_idle(client, "c");
     drop(daemon);
-    // Limited only now: describing takes long on a machine that is busy.
+    // The limit is set only now, since describing takes long on a busy machine.
     let env = [(POISON_VARIABLE, "1"), ("COSEG__WORK__SHAPE_SECONDS", "8")];
     let daemon = home.start_with(&["--workers", "2"], &env);
     let client = &mut daemon.client();
@@ -142,7 +143,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
             assert_eq!(pid(client), daemon.child.id(), "{what}: the same process");
         }
     }
-    // What never ends is ended at the limit; others are served meanwhile.
+    // An endless computation ends at the limit; others are served meanwhile.
     let endpoint = daemon.endpoint.as_str();
     std::thread::scope(|scope| {
         let endless = [map("loop", 20), correction("loop")]
@@ -159,29 +160,29 @@ fn what_poisons_an_answer_costs_that_request_alone() {
             assert_eq!(error.code(), ErrorCode::DeadlineExceeded);
         }
     });
-    // Nobody who waits no longer keeps a processor busy.
+    // Requests of vanished clients no longer occupy a processor.
     let error = ask(&daemon.endpoint, &asked(map("loop", 21), 300)).unwrap_err();
     assert_eq!(error.reason(), ErrorReason::Deadline, "{error:?}");
     let begin = Instant::now();
-    // One that described, one that placed and one that answered, at most two of each.
+    // At most two workers each for describing, placing and answering.
     while is_busy(&daemon) {
         assert!(begin.elapsed() < Duration::from_secs(5), "it goes on");
         std::thread::sleep(Duration::from_millis(50));
     }
-    // Nothing was changed, and all of it can be.
+    // Nothing was changed, and all changes are possible.
     assert_eq!(super::events_since(client, "c").len(), events);
     assert_eq!(pid(client), daemon.child.id());
     ask(&daemon.endpoint, &asked(correction("b"), 0)).unwrap();
     wait_idle(client, "c");
 }
 
-/// Whether a process that the daemon has started is running now.
+/// Whether a child process of the daemon is running.
 fn is_busy(daemon: &Daemon) -> bool {
     let parent = daemon.child.id().to_string();
     let stat = |entry: std::fs::DirEntry| std::fs::read_to_string(entry.path().join("stat"));
     let all = std::fs::read_dir("/proc").unwrap().flatten();
     all.filter_map(|entry| stat(entry).ok()).any(|stat| {
-        // After the name in brackets: state and parent.
+        // The state and the parent follow the name in brackets.
         let rest = stat.rsplit(") ").next().unwrap_or_default();
         let mut words = rest.split(' ');
         words.next() == Some("R") && words.next() == Some(&parent)
@@ -208,10 +209,10 @@ fn a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again() {
     assert_eq!(late.reason(), ErrorReason::Deadline, "{late:?}");
     assert!(late.message.contains("the change goes on"), "{late:?}");
     assert!(late.message.contains("its request_id"), "{late:?}");
-    // It is answered while the change, which takes two seconds, is under way.
+    // The request is answered while the change, which takes two seconds, is running.
     assert!(took < Duration::from_millis(1500), "{took:?}");
     println!("a deadline of 400 ms was answered after {took:?}");
-    // What waits behind it was not begun when its deadline passes, and is not made later.
+    // A change that waits behind it has not begun when its deadline passes, and is not made later.
     let behind = ask(&daemon.endpoint, &asked(correction("a"), 200)).unwrap_err();
     assert!(behind.message.contains("was not begun"), "{behind:?}");
     let Ok(reply::Result::CorrectLabels(done)) = ask(&daemon.endpoint, &named(0)) else {
@@ -229,7 +230,7 @@ fn a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again() {
         events.iter().filter(is_correction).count()
     };
     assert_eq!(corrected(client), 1);
-    // Without a name it cannot be asked for again, and goes on all the same.
+    // Without a request id it cannot be repeated, but it continues nevertheless.
     let unnamed = ask(&daemon.endpoint, &asked(correction("slow"), 400)).unwrap_err();
     assert!(
         unnamed.message.ends_with("the change goes on"),

@@ -1,4 +1,5 @@
-//! Corrections over the real socket and the command line: carried, refused, undone, resumed.
+//! Tests corrections over the real socket and the command line: propagated, refused, undone,
+//! resumed.
 
 use super::{events_since, wait_idle};
 use crate::harness::{Daemon, Home, SKITTLE_FACES, add, json, refusal, skittle, stdout};
@@ -11,7 +12,8 @@ use coseg::ipc::wire::{
 use rustix::process::Signal;
 use std::collections::BTreeMap;
 
-/// Labels of a [`skittle`]: 9 up to the neck, 4 above; faces are numbered from the foot up, sector by sector.
+/// Labels of a [`skittle`]: 9 up to the neck, 4 above; faces are numbered from the bottom up,
+/// sector by sector.
 fn truth() -> Vec<i32> {
     let per_sector = SKITTLE_FACES / 16;
     let ring = |face: usize| (face % per_sector).saturating_sub(2) / 2 + 1;
@@ -70,7 +72,7 @@ fn correct(client: &mut Client, shape: &str, labels: &[i32]) -> wire::CorrectLab
         .0
 }
 
-/// Least share of right faces of all shapes but one.
+/// Least share of right faces over all shapes but one.
 fn worst(found: &BTreeMap<String, Vec<i32>>, but: &str) -> f64 {
     let truth = truth();
     let right = |labels: &Vec<i32>| {
@@ -173,7 +175,7 @@ fn a_correction_changes_the_others_survives_a_restart_and_is_undone() {
 fn kill_9_while_a_correction_is_carried_loses_nothing() {
     let home = Home::new();
     let (daemon, mut client) = stocked(&home, 6);
-    // What comes of it undisturbed.
+    // The result without interruption.
     correct(&mut client, "s1", &truth());
     wait_idle(&mut client, "c");
     let undisturbed = snapshot(&mut client);

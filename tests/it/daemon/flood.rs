@@ -1,5 +1,6 @@
-//! Clients that take what is nobody's: that never read, never finish a message, subscribe without end, or connect
-//! without end. The daemon's memory stays bounded, and whoever behaves is served meanwhile.
+//! Tests clients that exhaust shared resources: they never read, never finish a message, subscribe
+//! without end, or connect without end. The daemon's memory stays bounded, and other clients are
+//! served meanwhile.
 
 use crate::harness::{Daemon, Home, add, skittle};
 use coseg::call;
@@ -12,16 +13,16 @@ use std::os::unix::net::UnixStream;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// The least that `limits.memory` may be; beyond it and a quarter the daemon must not grow.
+/// The least value of `limits.memory`; the daemon must not grow beyond it plus a quarter.
 const LIMIT: u64 = 256 << 20;
 const SMALL: [(&str, &str); 2] = [
     ("COSEG__LIMITS__MEMORY", "256MiB"),
     ("COSEG__LIMITS__MAX_MESSAGE", "16MiB"),
 ];
-/// Long enough for what must happen on a machine that is busy with other tests.
+/// A time limit that suffices on a machine that is busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A connection that speaks the protocol of ZeroMQ by hand.
+/// A connection with a hand-written implementation of ZeroMQ's protocol.
 struct Hand(UnixStream);
 
 impl Hand {
@@ -80,7 +81,7 @@ fn stats(client: &mut Client) -> wire::StatsReply {
     call!(client, Stats(wire::StatsRequest {})).unwrap()
 }
 
-/// The 99th percentile of the times in which a client that behaves is answered, for as long as `work` takes.
+/// The 99th percentile of the response times for a well-behaved client while `work` runs.
 fn beside<T>(daemon: &Daemon, work: impl FnOnce() -> T) -> (Duration, T) {
     let over = AtomicBool::new(false);
     let mut client = daemon.client();
@@ -108,7 +109,7 @@ fn beside<T>(daemon: &Daemon, work: impl FnOnce() -> T) -> (Duration, T) {
     })
 }
 
-/// Asks for far more than there is memory for, and reads nothing.
+/// Requests far more data than fits into memory, and reads nothing.
 fn read_nothing(path: &str) -> Vec<Hand> {
     let asking = |_| {
         let mut hand = Hand::new(path, "DEALER");
@@ -135,11 +136,12 @@ fn read_nothing(path: &str) -> Vec<Hand> {
 fn finish_nothing(path: &str) {
     let mut several: Vec<Hand> = (0..4).map(|_| Hand::new(path, "DEALER")).collect();
     let piece = vec![7; 4 << 20];
-    // In turn, so that they have as much as each other; far more than there is room for.
+    // The clients send in turn, so that all have equally much in flight; together far more than the
+    // limit.
     for _ in 0..40 {
         several.retain_mut(|hand| hand.send(1, &piece).is_ok());
     }
-    // Each of them is within the room that there is when it is alone.
+    // Each message is within the limit of a single client.
     assert!(several.len() < 4, "none was ended");
     let mut one = Hand::new(path, "DEALER");
     let sent = (0..100).take_while(|_| one.send(1, &piece).is_ok()).count();
@@ -166,7 +168,7 @@ fn finish_nothing(path: &str) {
     );
 }
 
-/// Subscribes to what there is not, without end.
+/// Subscribes endlessly to collections that do not exist.
 fn subscribe_to_all(path: &str) -> Vec<Hand> {
     let path = format!("{path}.events");
     let subscribing = |n: u32| {
@@ -180,7 +182,7 @@ fn subscribe_to_all(path: &str) -> Vec<Hand> {
         };
         let ended = (0..4_000).any(|i| hand.send(0, &topic(i)).is_err());
         assert!(ended || hand.ends(), "4,000 subscriptions");
-        // This may stay.
+        // This connection may stay.
         let mut hand = Hand::new(&path, "SUB");
         hand.send(0, &topic(0)[..20]).unwrap();
         hand
@@ -195,7 +197,7 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     let path = home.endpoint().strip_prefix("ipc://").unwrap().to_owned();
     let mut client = daemon.client();
     let mesh = skittle(0);
-    // Its comment is what is stored and sent; it does not compress.
+    // Its comment is stored and sent, and does not compress.
     let mut state = 1_u64;
     let noise = (0..4 << 20).map(|_| {
         state = state
@@ -221,7 +223,7 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     let mut watching = daemon.client();
     let (p99, silent) = beside(&daemon, || {
         let silent = read_nothing(&path);
-        // What they hold is told.
+        // Their memory is reported.
         let begin = Instant::now();
         while stats(&mut watching).memory_reserved_bytes < 16 << 20 {
             assert!(begin.elapsed() < PATIENCE, "nothing is reserved");
@@ -235,7 +237,7 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     check("finishing nothing", p99, &daemon);
     let (p99, subscribed) = beside(&daemon, || subscribe_to_all(&path));
     check("subscribing to all", p99, &daemon);
-    // Whoever comes later hears as before.
+    // Later clients are served as before.
     let heard = watching.subscribe(None).unwrap();
     heard.set_rcvtimeo(PATIENCE.as_millis() as i32).unwrap();
     heard.recv_msg(0).unwrap();
@@ -252,7 +254,7 @@ fn memory_is_bounded_whatever_clients_do_not_do() {
     check("all together", p99, &daemon);
     drop(held);
     let begin = Instant::now();
-    // But for what this request takes itself.
+    // The memory of this request itself is excepted.
     while stats(&mut client).memory_reserved_bytes > 1 << 20 {
         assert!(begin.elapsed() < PATIENCE, "memory stays reserved");
     }
@@ -279,7 +281,8 @@ fn a_slow_reader_gets_all_that_it_asked_for() {
         };
         socket.send(request.encode_to_vec(), 0).unwrap();
     }
-    // More than its share, and than all replies may take: it is answered as it reads.
+    // The reply exceeds the share of a client and that of all replies, so it is sent as the client
+    // reads.
     for _ in 0..n {
         let reply = socket.recv_multipart(0).unwrap();
         assert_eq!(
@@ -308,7 +311,7 @@ fn ten_thousand_connections_leave_a_good_client_served() {
         let mut client = daemon.client();
         add(&mut client, "c", &[("a", &skittle(0))]);
         let (alone, ()) = beside(&daemon, || ());
-        // More at a time than the daemon may have files.
+        // More simultaneous connections than the daemon may open files.
         let (p99, crowd) = beside(&daemon, || {
             let mut crowd = VecDeque::new();
             for n in 0..10_000 {
@@ -333,7 +336,7 @@ fn ten_thousand_connections_leave_a_good_client_served() {
         let allowed = (2 * alone).max(Duration::from_millis(100));
         assert!(p99 <= allowed, "{p99:?}, alone {alone:?}");
         assert!(crowd.len() > 300, "{}", crowd.len());
-        // Beside those that are still connected, workers get their files, and newcomers get in.
+        // Beside the connections that remain, workers get their files, and new clients can connect.
         add(&mut client, "c", &[("b", &skittle(1))]);
         stats(&mut daemon.client());
         drop(crowd);

@@ -1,4 +1,5 @@
-//! What comes over HTTP costs HTTP: monitoring, the sockets and signals are served beside it.
+//! Tests that HTTP requests cost only HTTP: monitoring, the sockets and signals are served
+//! meanwhile.
 
 use crate::harness::{Daemon, Home, SKITTLE_FACES, add, skittle};
 use crate::viewing::{exchange, get, served};
@@ -11,13 +12,14 @@ use std::time::{Duration, Instant};
 
 /// More connections than the daemon keeps.
 const CROWD: usize = 200;
-/// What is promised, and what the fastest of several takes on a machine that other tests keep busy.
+/// The promised limit, and the limit of the fastest of several attempts on a machine that is busy
+/// with other tests.
 const PROMISED: Duration = Duration::from_millis(100);
 /// The daemon waits ten seconds for a peer. A request that takes half of that waited for a place.
 const WAITED: Duration = Duration::from_secs(5);
 
-/// The fastest of several: how long it takes, and not how busy the machine is. None of them waits
-/// until peers that hang have had their time.
+/// The fastest of several attempts, which measures the work rather than the load of the machine.
+/// None of them waits until hanging peers have reached their time limit.
 fn fastest(what: &str, mut ask: impl FnMut()) -> Duration {
     let times = (0..10).map(|_| {
         let begin = Instant::now();
@@ -40,7 +42,7 @@ fn hello(client: &mut Client) {
         .unwrap();
 }
 
-/// Monitoring and the sockets answer within what is promised.
+/// Checks that monitoring and the sockets answer within the promised time.
 fn assert_served(beside: &str, daemon: &Daemon, address: SocketAddr) {
     for path in ["/healthz", "/readyz", "/metrics"] {
         let took = fastest(&format!("{path} beside {beside}"), || {
@@ -56,7 +58,7 @@ fn assert_served(beside: &str, daemon: &Daemon, address: SocketAddr) {
 fn crowd(address: SocketAddr, says: &str) -> Vec<TcpStream> {
     let one = |_| {
         let mut stream = TcpStream::connect(address).unwrap();
-        // Whoever had to make way is gone.
+        // The displaced connections are closed.
         let _ = stream.write_all(says.as_bytes());
         stream
     };
@@ -154,7 +156,7 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
         assert!(status == 400 || status == 404, "{runs}: {status}");
         assert!(text.contains(said), "{runs}: {text}");
     }
-    // As many as a body may have, each over the whole shape, from several pages at once.
+    // As many faces as a body may have, each over the whole shape, from several pages at once.
     let runs = format!("[0,{n},1],").repeat(500_000);
     let runs = runs.trim_end_matches(',');
     std::thread::scope(|scope| {
@@ -169,7 +171,7 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
         }
     });
     assert_eq!(correct("a", n, "[0,10,1]").0, 200);
-    // With pages that go on asking, the daemon ends when it is told to.
+    // The daemon ends on request even if pages continue to send requests.
     let body = format!(r#"{{"collection":"c","shape":"a","n_polygons":{n},"runs":[{runs}]}}"#);
     let asked = format!("{}{body}", post(address, "/api/correct", body.len()));
     let pages: Vec<_> = (0..4)
@@ -188,7 +190,7 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
     drop((crowd, pages));
 }
 
-/// What is read until the daemon ends the connection.
+/// The bytes that are read until the daemon ends the connection.
 fn until_ended(stream: &mut TcpStream) -> Vec<u8> {
     let mut read = Vec::new();
     stream
@@ -218,7 +220,7 @@ fn peers_have_ten_seconds_each_time() {
     )
     .2
     .len();
-    // The request keeps its head, and what is read ahead, below what a head may have.
+    // The request stays below the limits on its head and on data read ahead.
     let n = 500;
     let mut unread = TcpStream::connect(address).unwrap();
     unread.write_all(page.repeat(n).as_bytes()).unwrap();
@@ -246,7 +248,7 @@ fn peers_have_ten_seconds_each_time() {
     let said = until_ended(&mut kept);
     assert!(said.starts_with(b"HTTP/1.1 200 ") && said.len() > length);
     in_time(begin);
-    // As long once more, so that it surely has had its time: what was under way comes, and no more.
+    // The same time again, so that requests in flight surely finish and no others arrive.
     until_ended(&mut TcpStream::connect(address).unwrap());
     let all = until_ended(&mut unread).len();
     println!("{all} bytes of {n} answers of {length} each");

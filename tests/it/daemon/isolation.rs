@@ -1,4 +1,5 @@
-//! Work on a shape cannot take the daemon down, and shapes that fail can be listed and tried again.
+//! Tests that work on a shape cannot end the daemon, and that failed shapes can be listed and
+//! retried.
 
 use super::wait_idle;
 use crate::harness::{Home, add, add_request, json, skittle, stdout};
@@ -46,7 +47,7 @@ fn poison_fails_alone_and_can_be_retried() {
     assert_eq!(job.items[4].state(), ItemState::Done, "{reasons:?}");
     let stats = call!(client, Stats(wire::StatsRequest {})).unwrap();
     assert_eq!(stats.pid, daemon.child.id(), "the same process");
-    // The next one is not kept waiting. What it takes by itself is measured here.
+    // The next shape does not wait. Its own time is measured here.
     let time = |client: &mut _, name: &str, variant| {
         let begin = Instant::now();
         add(client, "c", &[(name, &skittle(variant))]);
@@ -83,7 +84,7 @@ fn poison_fails_alone_and_can_be_retried() {
     );
     drop(daemon);
 
-    // An operator has mended what was wrong: without poison all of them are shapes like others.
+    // After an operator has removed the cause (here the poison), they are placed like others.
     let daemon = home.start();
     let client = &mut daemon.client();
     let retried = json(
@@ -98,7 +99,7 @@ fn poison_fails_alone_and_can_be_retried() {
         job.items.iter().all(|i| i.state() == ItemState::Done),
         "{job:?}"
     );
-    // Nothing is left to retry.
+    // No failed shape is left to retry.
     assert_eq!(
         home.coseg(&["retry", &job.job_id.to_string()])
             .status
@@ -107,7 +108,7 @@ fn poison_fails_alone_and_can_be_retried() {
     );
 }
 
-/// MiB that growing poison takes in the 200 ms within which it is to be seen, at its fastest.
+/// MiB by which growing poison grows, at most, in the 200 ms within which it must be noticed.
 const SEEN_WITHIN_MIB: u64 = 200;
 
 #[test]
@@ -115,7 +116,7 @@ fn memory_that_is_held_is_bounded_and_what_is_reserved_is_not() {
     let home = Home::new();
     let daemon = home.start_with(&["--workers", "1"], &[(POISON_VARIABLE, "1")]);
     let client = &mut daemon.client();
-    // It reserves eight times what it may hold, and uses none of it.
+    // It reserves eight times its limit, and uses none of it.
     let job = add(client, "c", &[("reserve", &poisoned("reserve"))]);
     assert_eq!(job.items[0].state(), ItemState::Done, "{job:?}");
     assert_eq!(job.items[0].attempts, 0, "no worker ended: {job:?}");
@@ -151,7 +152,7 @@ fn cancelling_stops_the_work_at_once() {
     let reply::Result::AddShapes(accepted) = client.call(body, frames).unwrap().0 else {
         panic!("not accepted")
     };
-    // It is under way, for ever: the limit is ten minutes.
+    // The work runs without end: the limit is ten minutes.
     let job_id = accepted.job_id;
     let job = call!(client, CancelJob(wire::CancelJobRequest { job_id }))
         .unwrap()
@@ -210,7 +211,7 @@ fn attempts_are_counted_across_restarts() {
         ..Default::default()
     };
     assert_eq!(library.jobs(&filter, 10).unwrap().len(), 1);
-    // The bytes stay, so that it can be retried; attempts begin anew.
+    // The bytes stay, so that it can be retried; attempts start from zero.
     library.store().sweep_orphans(Duration::ZERO).unwrap();
     let (again, items) = library.retry(job.id).unwrap();
     assert_eq!((items.len(), again.items[0].attempts), (1, 0));

@@ -1,4 +1,4 @@
-//! The daemon starts, stops, is killed and comes back.
+//! Tests that the daemon starts, stops, is killed and recovers.
 
 use super::{events_since, wait_idle};
 use crate::harness::{DEADLINE, Daemon, Home, add_request, exists, refusal, skittle};
@@ -50,7 +50,7 @@ fn what_term_leaves_is_taken_up_at_the_next_start() {
 fn a_second_term_exits_at_once() {
     let home = Home::new();
     let mut daemon = home.start();
-    // The daemon cannot get past telling the service manager that it stops: nobody reads.
+    // The daemon blocks when it reports the stop to the service manager, because nothing reads.
     daemon.notify.set_nonblocking(true).unwrap();
     let filler = std::os::unix::net::UnixDatagram::unbound().unwrap();
     filler.set_nonblocking(true).unwrap();
@@ -203,7 +203,7 @@ fn kill_9_loses_nothing_that_was_accepted() {
         panic!("not accepted")
     };
     let job_id = accepted.job_id;
-    // In the middle: as soon as one is placed.
+    // The kill comes in the middle: as soon as one shape is placed.
     let mut revision = 0;
     loop {
         let request = wire::WatchJobRequest {

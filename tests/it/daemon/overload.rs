@@ -1,4 +1,5 @@
-//! More than the daemon can take: refused with a delay, nothing acknowledged is lost, others are served.
+//! Tests overload: requests are refused with a delay, no acknowledged shape is lost, other requests
+//! are served.
 
 use super::{create, wait_idle};
 use crate::harness::{Home, add_request, additions, refusal, skittle};
@@ -66,7 +67,8 @@ fn ten_times_too_much_from_64_clients_is_refused_politely() {
         refused.into_inner().unwrap(),
     );
     println!(
-        "{} accepted, {refused} refused; p99 of accepted {:?}, of hello {alone:?} alone, {during:?} loaded",
+        "{} accepted, {refused} refused; p99 of accepted {:?}, of hello {alone:?} alone, \
+         {during:?} loaded",
         accepted.len(),
         p99(waits.into_inner().unwrap())
     );
@@ -92,7 +94,7 @@ fn ten_times_too_much_from_64_clients_is_refused_politely() {
     assert!(stats.resident_bytes < stats.memory_limit_bytes);
 }
 
-/// Clients that come back after the delay they were told, for as long as there is too much.
+/// Clients that retry after the delay in the refusal, while the overload lasts.
 #[test]
 fn what_is_accepted_under_overload_is_accepted_quickly() {
     let seconds = crate::harness::number("COSEG_TEST_SECONDS", 8);
@@ -105,7 +107,7 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
         let (request, frames) = additions("c", &[(name, &mesh)], wire::AddMode::Job);
         (Body::AddShapes(request), frames)
     };
-    // One client that adds one after the other, which leaves room in the queue.
+    // A single client that adds shapes one after the other, which leaves room in the queue.
     let mut alone = Vec::new();
     let one = &mut daemon.client();
     for n in 0..20 {
@@ -117,7 +119,7 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
     }
     let taken = Mutex::new((Vec::new(), Vec::new()));
     let later = Mutex::new(Vec::new());
-    // Who adds is connected: making connections is not what is measured.
+    // The clients are connected beforehand, since connecting is not measured.
     let ready = Barrier::new(64);
     std::thread::scope(|scope| {
         for client in 0..64 {
@@ -160,22 +162,24 @@ fn what_is_accepted_under_overload_is_accepted_quickly() {
     median.sort();
     let (alone, loaded) = (p99(alone), p99(accepted));
     println!(
-        "{seconds} s: {n} accepted, {n_refused} refused; accepted in {:?} (median), {loaded:?} (p99), \
-         {:?} (p99) after the first second; {alone:?} (p99) unloaded; refused in {:?} (p99), {:?} (slowest)",
+        "{seconds} s: {n} accepted, {n_refused} refused; accepted in {:?} (median), {loaded:?} \
+         (p99), {:?} (p99) after the first second; {alone:?} (p99) unloaded; refused in {:?} \
+         (p99), {:?} \
+         (slowest)",
         median[n / 2],
         p99(later.into_inner().unwrap()),
         p99(refused.clone()),
         refused.iter().max().expect("some are refused")
     );
     assert!(n_refused > 64, "{n_refused}");
-    // In the first moment 64 threads on this side, too, want a processor.
+    // In the first moment 64 threads of the clients compete for processors, too.
     let allowed = (2 * alone).max(Duration::from_secs(1));
     assert!(loaded <= allowed, "{loaded:?}, unloaded {alone:?}");
     let stats = call!(one, Stats(wire::StatsRequest {})).unwrap();
     assert!(stats.resident_bytes < stats.memory_limit_bytes);
 }
 
-/// With the time that clients allow by default, while the workers have their hands full.
+/// With the default timeout of clients, while all workers are busy.
 #[test]
 fn large_files_are_taken_in_while_the_machine_is_busy() {
     let home = Home::new();
@@ -231,7 +235,7 @@ fn what_the_queue_can_never_hold_is_refused_for_good() {
         }
         other => panic!("{other:?}"),
     }
-    // One client has at most four requests in hand; others have their own.
+    // One client has at most four unfinished requests; others have limits of their own.
     let dealer = super::raw(zmq::DEALER, &home.endpoint());
     let waiting = |id: &str| {
         use prost::Message as _;
@@ -251,7 +255,7 @@ fn what_the_queue_can_never_hold_is_refused_for_good() {
         }
         .encode_to_vec()
     };
-    // Something to wait for: it is not idle while these are placed.
+    // The daemon has work: it is not idle while these shapes are placed.
     let (body, frames) = add_request("c", &shapes[..3], wire::AddMode::Job);
     client.call(body, frames).unwrap();
     for id in ["1", "2", "3", "4"] {

@@ -1,4 +1,4 @@
-//! Files that requests name by path.
+//! Tests files that requests name by path.
 
 use super::{create, create_with, raw};
 use crate::harness::{Home, add, skittle};
@@ -78,7 +78,7 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
     let daemon = home.start_with(&[], &[("COSEG__INGEST__PATHS", &roots)]);
     let client = &mut daemon.client();
     create_with(client, "c", 2);
-    // A pipe that nobody writes into is none that anybody waits for.
+    // A pipe without a writer does not make the daemon wait.
     let pipe = allowed.join("pipe.off");
     let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
     rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, mode, 0).unwrap();
@@ -88,7 +88,8 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
         (ErrorCode::InvalidArgument, ErrorReason::PathUnreadable)
     );
 
-    // A file that another process has leased and does not give back hangs for whoever opens it, as a network file system
+    // Opening a file that another process has leased and does not release hangs, like a file on an
+    // unreachable network file system.
     // does that is away.
     let hangs = allowed.join("hangs.off");
     std::fs::write(&hangs, skittle(1)).unwrap();
@@ -130,7 +131,7 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
     for n in 0..20 {
         dealer.send(late(&format!("hangs{n}"), 4_000), 0).unwrap();
     }
-    // Others go on meanwhile, with bytes and with paths.
+    // Other requests continue meanwhile, with bytes and with paths.
     assert_eq!(
         add(client, "c", &[("bytes", &skittle(2))]).items[0].state(),
         ItemState::Done
@@ -150,7 +151,7 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
     }
     let took = begin.elapsed();
     assert!(took < Duration::from_secs(12), "{took:?}");
-    // Given back, it is a file like any other.
+    // Once released, it is an ordinary file.
     drop(holder.stdin.take());
     holder.wait().unwrap();
     let added = client.call(by_path("free", &hangs, wire::AddMode::Wait), Vec::new());

@@ -1,4 +1,4 @@
-//! Requests that are wrong whatever the library has.
+//! Tests requests that are invalid regardless of the library.
 
 use crate::harness::{Home, additions, refusal};
 use coseg::ipc::client::ClientError;

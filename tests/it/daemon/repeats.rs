@@ -1,4 +1,4 @@
-//! Requests that are sent again and again, and a subscriber that loses its connection, its daemon and its time.
+//! Tests repeated requests, and a subscriber that loses its connection and its daemon, and stalls.
 
 use super::{events_since, wait_idle};
 use crate::harness::{Daemon, Home, add_request, number, seed, skittle};
@@ -11,7 +11,7 @@ use rustix::process::Signal;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// `COSEG_TEST_ROUNDS` makes it longer.
+/// `COSEG_TEST_ROUNDS` makes the test longer.
 #[test]
 fn each_request_has_one_effect_however_often_it_is_sent() {
     let (n_rounds, seed) = (number("COSEG_TEST_ROUNDS", 1), seed());
@@ -100,7 +100,7 @@ fn send_each_again_and_again(seed: u64) {
             daemon = home.start();
             client = connect(&daemon);
         }
-        // This one, and earlier ones in any order.
+        // This request, and earlier ones in any order.
         for _ in 0..random.random_range(1..5) {
             let again = random.random_range(0..=i);
             assert_eq!(
@@ -119,7 +119,7 @@ fn send_each_again_and_again(seed: u64) {
     assert!(other.is_err(), "the id of another request");
 }
 
-/// Keeps a copy of a collection as docs/protocol.md tells clients to.
+/// Maintains a copy of a collection as docs/protocol.md prescribes for clients.
 struct Subscriber {
     socket: zmq::Socket,
     client: Client,
@@ -175,7 +175,7 @@ impl Subscriber {
         }
     }
 
-    /// Reads what there is, and asks for what it missed.
+    /// Reads pending events, and requests missed ones.
     fn read(&mut self, wait: Duration) {
         let until = Instant::now() + wait;
         while let Some(left) = until.checked_duration_since(Instant::now()) {
@@ -219,7 +219,7 @@ fn a_subscriber_converges_after_losses_restarts_and_stalls() {
     let mut subscriber = Subscriber::new(&daemon);
     feed(&daemon, 0..4);
     subscriber.read(Duration::from_millis(300));
-    // It loses its connection for a while, and comes back with what it has.
+    // It loses its connection for a while, and returns with its state.
     subscriber.socket = zmq::Context::new().socket(zmq::SUB).unwrap();
     feed(&daemon, 4..8);
     wait_idle(&mut daemon.client(), "c");
@@ -230,7 +230,7 @@ fn a_subscriber_converges_after_losses_restarts_and_stalls() {
     daemon.signal(Signal::KILL);
     drop(daemon.ended());
     daemon = home.start();
-    // It stalls while shapes come and go, and others crowd in and leave.
+    // It stalls while shapes are added and removed, and other subscribers join and leave.
     let crowd: Vec<_> = (0..20)
         .map(|_| daemon.client().subscribe(None).unwrap())
         .collect();

@@ -1,4 +1,5 @@
-//! Memory over many operations: the daemon's does not grow, and no healthy shape loses its worker to a limit of it.
+//! Tests memory over many operations: that of the daemon does not grow, and no healthy shape ends
+//! its worker by a memory limit.
 
 use super::wait_idle;
 use crate::harness::{Daemon, Home, add, additions, number, refusal, skittle, stdout};
@@ -9,17 +10,17 @@ use coseg::ipc::wire::{
 };
 use std::time::{Duration, Instant};
 
-/// Operations of a round.
+/// Number of operations of a round.
 const ROUND: u64 = 12;
-/// What the allocators may keep more at one time than at another, whatever the number of operations.
+/// Variation of the memory that allocators keep, independent of the number of operations.
 const NOISE: u64 = 2 << 20;
-/// The allocator gives back what has been free for ten seconds, and a sweep takes half a minute to
-/// come round.
+/// The allocator returns memory that has been free for ten seconds, and a sweep of all of it takes
+/// half a minute.
 const SETTLING: Duration = Duration::from_secs(45);
-/// What an operation may leave behind for good: less than anything that is kept of one by mistake.
+/// Memory that an operation may leave behind permanently: less than the smallest leak.
 const LEFT: u64 = 128;
 
-/// Bytes of a process's own memory, of which mapped files are no part.
+/// Size of a process's own memory, without mapped files.
 fn held(daemon: &Daemon) -> u64 {
     let status = std::fs::read_to_string(format!("/proc/{}/status", daemon.child.id())).unwrap();
     let line = status.lines().find_map(|l| l.strip_prefix("RssAnon:"));
@@ -27,7 +28,7 @@ fn held(daemon: &Daemon) -> u64 {
     kilobytes.parse::<u64>().unwrap() << 10
 }
 
-/// A mesh like no other.
+/// A mesh different from all others.
 fn wedge(n: u64) -> String {
     format!("OFF\n4 4 0\n0 0 0\n1 0 0.{n:05}\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n")
 }
@@ -46,8 +47,8 @@ fn put(
         .0
 }
 
-/// What the daemon holds once that is no more than `enough`, or the least within the time in which
-/// the allocator gives back what is free and files that nothing refers to are removed.
+/// The memory of the daemon once it is at most `enough`, or the least within the time in which the
+/// allocator returns free memory and unreferenced files are removed.
 fn settled(daemon: &Daemon, enough: u64) -> u64 {
     let begin = Instant::now();
     let mut least = u64::MAX;
@@ -137,7 +138,7 @@ fn round(daemon: &Daemon, client: &mut Client, n: u64) {
                 );
             }
             9 => {
-                // Another client, and another collection.
+                // Another client uses another collection.
                 let mut other = daemon.client();
                 let name = format!("z{n}");
                 let spec = wire::CollectionSpec {
@@ -183,7 +184,7 @@ fn memory_is_flat_over_operations() {
     add(client, "c", &shapes);
     add(client, "w", &[("x", &wedge(0))]);
     wait_idle(client, "c");
-    // Caches fill to their bounds.
+    // Caches fill up to their limits.
     let warm = (n / ROUND / 2).clamp(10, 100);
     (0..warm).for_each(|i| round(&daemon, client, i + 1));
     let before = settled(&daemon, 0);
@@ -195,7 +196,7 @@ fn memory_is_flat_over_operations() {
     assert!(after <= allowed, "{before} bytes, then {after}");
 }
 
-/// Meshes of so many faces, made by the program itself.
+/// Meshes with `n_faces` faces, written by the program itself.
 fn large(home: &Home, faces: u32) -> Vec<String> {
     let out = home.path("large");
     let (faces, folder) = (faces.to_string(), out.display().to_string());
@@ -237,7 +238,7 @@ fn healthy_meshes_cost_no_worker() {
     let client = &mut daemon.client();
     add(client, "c", &[("x", &meshes[0])]);
     for i in 0..n {
-        // Other bytes each time, so that all of it is done each time.
+        // Different bytes each time, so that nothing is reused.
         let text = format!("{}# {i}\n", meshes[i as usize % meshes.len()]);
         let reply = put(client, "c", "x", &text, wire::AddMode::Wait);
         assert_done_at_once(&reply.job.unwrap());
@@ -256,7 +257,7 @@ fn kills_and_resumed_work_cost_no_worker() {
         let client = &mut daemon.client();
         let text = format!("{}# {i}\n", meshes[i as usize % meshes.len()]);
         let job_id = put(client, "c", "x", &text, wire::AddMode::Job).job_id;
-        // At another moment each time: at once, or after some of its stages have begun.
+        // At a different moment each time: immediately, or after some of its stages have begun.
         let mut revision = 0;
         for _ in 0..i % 5 {
             let request = wire::WatchJobRequest {
@@ -270,7 +271,7 @@ fn kills_and_resumed_work_cost_no_worker() {
             }
             revision = job.revision;
         }
-        // Killed here.
+        // The daemon is killed here.
         drop(daemon);
         daemon = home.start();
         let client = &mut daemon.client();

@@ -1,4 +1,4 @@
-//! Keys: who is on the list gets in, and may do what the role says; nobody else gets anywhere.
+//! Tests keys: clients on the list may connect and use their role; others may do nothing.
 
 use super::create;
 use crate::harness::{Daemon, Home, add, additions, coseg, refusal, skittle, wait_idle};
@@ -10,11 +10,11 @@ use std::io::Write as _;
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-/// Long enough for a handshake on a busy machine, where one is to be refused.
+/// A time limit that suffices for a handshake on a busy machine, for tests that expect a refusal.
 const REFUSED: Duration = Duration::from_secs(2);
 const SERVED: Duration = Duration::from_secs(60);
 
-/// A daemon on every address of this machine, its folder of keys made by the commands.
+/// A daemon on all addresses of this machine, whose folder of keys is created by the commands.
 fn secured(home: &Home) -> (Daemon, String) {
     secured_with(home, &[])
 }
@@ -105,7 +105,7 @@ fn only_keys_on_the_list_get_in_and_roles_bound_what_they_do() {
     let n = call!(reader, ListCollections(wire::ListCollectionsRequest {})).unwrap();
     assert_eq!(n.collections.len(), 1);
 
-    // The command line takes the same files.
+    // The command line uses the same files.
     let stats = coseg()
         .args(["stats", "--endpoint", &endpoint, "--timeout", "60"])
         .env("COSEG_SERVER_KEY", home.path("keys/server.pub"))
@@ -139,7 +139,7 @@ fn a_revoked_key_is_refused_at_once_on_both_sockets() {
         next(&revoked, 30_000) && next(&stays, 30_000),
         "both hear heartbeats"
     );
-    // Nobody hears who has no key.
+    // A client without a key receives nothing.
     let plain = zmq::Context::new().socket(zmq::SUB).unwrap();
     plain.set_subscribe(b"").unwrap();
     let said = boss.hello().unwrap().event_endpoint.clone();
@@ -163,7 +163,8 @@ fn a_revoked_key_is_refused_at_once_on_both_sockets() {
             Err(e) => panic!("{e}"),
         }
     }
-    // What was under way may still arrive; then there is silence, where heartbeats came each second.
+    // Messages in flight may still arrive; then there is silence in place of a heartbeat each
+    // second.
     let begin = Instant::now();
     while next(&revoked, 3_000) {
         let heard = begin.elapsed() < Duration::from_secs(20);
@@ -184,7 +185,7 @@ fn what_waits_ends_when_its_key_is_revoked() {
         |name: &str| Client::connect_with(&endpoint, SERVED, Some(keys(&home, name))).unwrap();
     let mut boss = connect("boss");
     create(&mut boss, "c");
-    // One that never ends keeps all behind it waiting.
+    // An endless one makes all later ones wait.
     let endless = skittle(0).replacen("OFF\n", "OFF # poison: loop\n", 1);
     let (request, frames) = additions("c", &[("endless", &endless)], wire::AddMode::Job);
     let job = call!(boss, AddShapes(request), frames, with_frames)
@@ -272,13 +273,13 @@ fn a_client_id_belongs_to_the_key_that_uses_it() {
     };
     let first = job(&mut boss, "a", "first");
     assert_eq!(job(&mut boss, "a", "first"), first);
-    // The same request of another key is another request, and so is another one.
+    // The same request under another key is a different request, and so is a third key's.
     let second = job(&mut feeder, "a", "first");
     assert_ne!(second, first);
     assert_eq!(job(&mut feeder, "a", "first"), second);
     job(&mut feeder, "b", "second");
     job(&mut boss, "c", "second");
-    // A change that is carried out elsewhere, too.
+    // This holds for a change that is carried out in a worker, too.
     wait_idle(&mut boss, "c");
     let remove = |client: &mut Client, shape: &str| {
         let (collection, shape) = ("c".to_owned(), shape.to_owned());
@@ -309,7 +310,7 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
     };
     let before = slowest_of(300);
     let address = endpoint.strip_prefix("tcp://").unwrap();
-    // Half of them say nothing, the others something else than ZeroMQ.
+    // Half of the connections send nothing, the others send something other than ZeroMQ.
     let crowd: Vec<TcpStream> = (0..1_000)
         .map(|i| {
             let mut stream = TcpStream::connect(address).unwrap();
@@ -321,11 +322,11 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
         .collect();
     let during = slowest_of(300);
     println!("p99 of a good client: {before:?} alone, {during:?} beside 1,000 open connections");
-    // A machine that is busy with other tests has hiccups of its own.
+    // A machine that is busy with other tests has delays of its own.
     let allowed = (2 * before).max(Duration::from_millis(100));
     assert!(during <= allowed, "{during:?}, alone {before:?}");
     drop(crowd);
-    // A topic and a frame beyond their limits: each ends its connection only.
+    // A topic and a frame beyond their limits each end only their connection.
     let context = zmq::Context::new();
     let keys = keys(&home, "feeder");
     let mut reader = Client::connect_with(&endpoint, SERVED, Some(keys.clone())).unwrap();
@@ -335,7 +336,7 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
     keys.apply(&subscriber).unwrap();
     subscriber.set_linger(0).unwrap();
     subscriber.set_subscribe(&vec![b'x'; 64 << 10]).unwrap();
-    // With it, everything: the heartbeats would be heard if the connection stayed.
+    // A subscription to all topics would receive heartbeats if the connection stayed.
     subscriber.set_subscribe(b"").unwrap();
     subscriber
         .connect(&format!("tcp://127.0.0.1:{port}"))
@@ -350,8 +351,8 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
     assert!(stats.resident_bytes < 512 << 20, "{}", stats.resident_bytes);
 }
 
-/// A connection that speaks the protocol of ZeroMQ by hand: its own sockets fall over a topic of ten megabytes
-/// themselves, on the client's side, for they go into its tree of topics by recursion.
+/// A connection with a hand-written implementation of ZeroMQ's protocol. ZeroMQ's own client
+/// crashes for a topic of ten megabytes, since it inserts topics into its tree by recursion.
 fn by_hand(address: &str, socket_type: &str) -> TcpStream {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(SERVED)).unwrap();
@@ -370,7 +371,7 @@ fn by_hand(address: &str, socket_type: &str) -> TcpStream {
     stream
 }
 
-/// Whether the daemon ends the connection over a frame that is announced with this length.
+/// Whether the daemon ends the connection over a frame with this announced length.
 fn is_ended_over(mut stream: TcpStream, length: u64) -> bool {
     let mut header = vec![2];
     header.extend(length.to_be_bytes());
@@ -385,7 +386,7 @@ fn is_ended_over(mut stream: TcpStream, length: u64) -> bool {
         }
         left -= n;
     }
-    // What was still sent, a heartbeat perhaps; then the end.
+    // Remaining data, perhaps a heartbeat, then the end.
     stream
         .set_read_timeout(Some(Duration::from_secs(5)))
         .unwrap();

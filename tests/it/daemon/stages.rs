@@ -1,5 +1,5 @@
-//! Whatever a shape is at, it can be cancelled, ends a worker and not the daemon, and keeps nobody waiting beyond a
-//! deadline.
+//! Tests that a shape can be cancelled in every stage, that it can end a worker but not the daemon,
+//! and that it makes no request wait beyond its deadline.
 
 use super::create_with;
 use crate::harness::{Daemon, Home, add_request, skittle};
@@ -14,7 +14,7 @@ fn poisoned(poison: &str) -> String {
     skittle(3).replacen("OFF\n", &format!("OFF # poison: {poison}\n"), 1)
 }
 
-/// Submits one shape and gives the job.
+/// Submits one shape and returns the job.
 fn submit(client: &mut Client, name: &str, text: &str) -> u64 {
     let (body, frames) = add_request("c", &[(name, text)], wire::AddMode::Job);
     match client.call(body, frames).unwrap().0 {
@@ -59,7 +59,7 @@ fn work_is_cancelled_at_every_stage() {
     let home = Home::new();
     let daemon = home.start_with(&["--workers", "1"], &[(POISON_VARIABLE, "1")]);
     let client = &mut daemon.client();
-    // Several shapes, so that the next is an occasion to cluster anew.
+    // Several shapes, so that the next one triggers a re-clustering.
     for name in ["a", "b"] {
         submit(client, name, &skittle(0));
     }
@@ -70,7 +70,7 @@ fn work_is_cancelled_at_every_stage() {
         if poison == "loop-placing" {
             wait_for_stage(client, endless, "place");
         }
-        // Queued, before anything is done for it; then what keeps it there.
+        // The shape is queued, before any work on it; then the work that blocks it there starts.
         assert_eq!(cancel(client, behind), ItemState::Cancelled);
         assert_eq!(cancel(client, endless), ItemState::Cancelled);
         let next = placed_after(client, &format!("after {poison}"));
@@ -123,7 +123,7 @@ fn what_poisons_the_placing_fails_alone() {
     println!("the next shape is placed within {next:?}");
 }
 
-/// A request with a deadline, to a daemon that cannot meet it.
+/// A request with a deadline that the daemon cannot meet.
 fn late(daemon: &Daemon, body: Body, ms: u64) -> wire::Error {
     use prost::Message as _;
     let request = wire::Request {
@@ -150,7 +150,8 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
         submit(client, name, &skittle(0));
     }
     super::wait_idle(client, "c");
-    // While it is placed nobody else may change the collection: whoever waits for that is told in time.
+    // While the shape is placed, the collection cannot change; requests that wait for it are
+    // answered in time.
     let endless = submit(client, "endless", &poisoned("loop-placing"));
     wait_for_stage(client, endless, "place");
     let request = wire::GetJobRequest { job_id: endless };
@@ -167,7 +168,7 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             shape: "a".to_owned(),
             correction: Some(wire::correct_labels_request::Correction::Part(part)),
         }),
-        // Behind the correction, at the gate of the collection.
+        // Behind the correction, waiting for the collection.
         Body::Undo(wire::UndoRequest { collection: c() }),
         Body::WaitIdle(wire::WaitIdleRequest {
             collection: c(),
@@ -188,7 +189,7 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             "{what}: {error:?}"
         );
     }
-    // What changes nothing waits for nobody, nor does what is asked of another collection.
+    // Reads do not wait, nor do requests for another collection.
     let nearest = wire::NearestRequest {
         collection: c(),
         shape: "a".to_owned(),
@@ -198,7 +199,7 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
     assert_eq!(neighbors.len(), 1);
     create_with(client, "d", 2);
     assert_eq!(cancel(client, endless), ItemState::Cancelled);
-    // The correction was not forgotten: it was late, and is done now that it can be.
+    // The correction was not dropped: it was late, and is made now that it is possible.
     super::wait_idle(client, "c");
     placed_after(client, "next");
 }
@@ -221,7 +222,7 @@ fn kills_while_a_start_takes_up_what_a_kill_left_lose_nothing() {
     drop(daemon.ended());
     for _ in 0..n_kills {
         let daemon = home.spawn(&[], &[]);
-        // Anywhere from before the library is open to the middle of the placing.
+        // The kill comes between opening the library and the middle of placing.
         let ms = rand::Rng::random_range(&mut random, 0..600);
         std::thread::sleep(Duration::from_millis(ms));
         daemon.signal(Signal::KILL);
@@ -273,7 +274,7 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
         };
         call!(client, GetLabels(request)).map(|_| ())
     };
-    // All the room there is, to the last block.
+    // The disk is filled to the last block.
     let filler = library.join("filler");
     let mut file = std::fs::File::create(&filler).unwrap();
     while std::io::Write::write_all(&mut file, &[0; 4096]).is_ok() {}
@@ -286,7 +287,7 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
         other => panic!("{other:?}"),
     }
     labels(client).unwrap();
-    // What frees space is done with the room that is kept for it, and the space comes back.
+    // Changes that free space use the reserved space, and the space becomes available again.
     remove(client, "gone");
     labels(client).unwrap();
     let begin = Instant::now();
@@ -302,7 +303,8 @@ fn a_full_disk_refuses_changes_serves_reads_and_passes() {
         begin.elapsed()
     );
     while std::io::Write::write_all(&mut file, &[0; 4096]).is_ok() {}
-    // Room for the bytes and the job, not for what the placing stores: it waits, and goes on by itself.
+    // There is room for the bytes and the job, but not for the placement: the shape waits, and
+    // continues by itself.
     file.set_len(std::fs::metadata(&filler).unwrap().len() - (160 << 10))
         .unwrap();
     let job = submit(client, "waits", &skittle(2));
@@ -354,7 +356,7 @@ fn space_of_removed_shapes_comes_back_within_a_minute() {
     assert_eq!(n_objects(&library), 3);
     remove(client, "goes");
     remove(client, "again");
-    // What is added anew in the meantime is there afterwards.
+    // Data that are added again in the meantime exist afterwards.
     submit(client, "again", &skittle(2));
     super::wait_idle(client, "c");
     let begin = Instant::now();
@@ -381,7 +383,7 @@ fn space_of_removed_shapes_comes_back_within_a_minute() {
     assert_eq!(coseg::Library::check(&library).unwrap(), []);
 }
 
-/// A file system of a few megabytes; gone when dropped.
+/// A file system of a few megabytes; unmounted when dropped.
 struct Mounted(std::path::PathBuf);
 
 impl Mounted {

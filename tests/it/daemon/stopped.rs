@@ -1,6 +1,7 @@
-//! A subscriber that is stopped while events come as fast as they can, and others that come and go.
+//! Tests a subscriber that is stopped during a rapid stream of events, and others that join and
+//! leave.
 //!
-//! `COSEG_TEST_EVENTS` makes it longer.
+//! `COSEG_TEST_EVENTS` makes the test longer.
 
 use crate::harness::{Home, add, number, skittle};
 use coseg::call;
@@ -51,7 +52,7 @@ fn a_stopped_subscriber_harms_nobody_and_misses_nothing() {
             }
         }
     });
-    // It hears what there was, and is stopped.
+    // It receives the past events, and is stopped.
     let next = || heard.recv_timeout(Duration::from_secs(60)).unwrap();
     for sequence in 1..=first {
         assert_eq!(next(), sequence);
@@ -91,11 +92,12 @@ fn a_stopped_subscriber_harms_nobody_and_misses_nothing() {
     let grown = resident(&mut other).saturating_sub(before);
     let (alone, beside) = (p99(alone), p99(beside));
     println!(
-        "{n_events} events; p99 of hello {alone:?} before, {beside:?} beside the stopped one; {} MB more resident",
+        "{n_events} events; p99 of hello {alone:?} before, {beside:?} beside the stopped one; {} \
+         MB more resident",
         grown >> 20
     );
     assert!(grown < 64 << 20, "{grown}");
-    // A machine that is busy with other tests has hiccups of its own.
+    // A machine that is busy with other tests has delays of its own.
     assert!(
         beside <= (alone * 12 / 10).max(Duration::from_millis(200)),
         "{alone:?} {beside:?}"

@@ -1,4 +1,5 @@
-//! Another up axis over the real socket and the command line: noticed, changed, killed in the middle.
+//! Tests changes of the up axis over the real socket and the command line: the warning, the change,
+//! a kill in the middle.
 
 use super::{events_since, wait_idle};
 use crate::harness::{Home, add, json, refusal, stdout};
@@ -110,7 +111,7 @@ fn an_axis_that_is_missing_or_unknown_is_refused() {
     );
 }
 
-/// Killed at other moments the more often something was answered in between.
+/// The more requests are answered in between, the more moments of the kill are tested.
 #[test]
 fn kill_9_while_the_axis_changes_leaves_the_old_or_the_new_one() {
     for n_answers in [0, 3, 30] {
@@ -163,7 +164,7 @@ fn kill_9_while_the_axis_changes_leaves_the_old_or_the_new_one() {
         );
         assert_eq!(found.n_undoable, u64::from(is_new));
         assert!(is_new || !answered, "what was answered is durable");
-        // The same request again: one effect.
+        // Repeating the request has one effect.
         client.call_as("once", body, vec![]).unwrap();
         wait_idle(&mut client, "c");
         let events = events_since(&mut client, "c");

@@ -1,4 +1,5 @@
-//! Maps that are kept: found again, forgotten with their shapes, and mended where they do not agree with the others.
+//! Tests stored maps: found again, deleted with their shapes, and recomputed if they disagree with
+//! the others.
 
 use crate::pipeline::{COLLECTION, SMALL, library, stream};
 use coseg::Library;
@@ -44,7 +45,8 @@ fn maps_between_points_are_kept_and_go_with_their_shapes() {
     assert!(keys(folder.path()).is_empty());
 }
 
-/// The map from one shape to another, with the vertices of the second in reverse: it says nothing.
+/// The map between two shapes, with the vertices of the second in reverse, which makes it
+/// meaningless.
 fn spoilt(library: &Library, row: &MapRow, names: (&str, &str)) -> MapRow {
     let (a, b) = (
         library.description(COLLECTION, names.0).unwrap(),
@@ -77,13 +79,13 @@ fn a_planted_wrong_map_is_found_and_made_anew() {
     let shapes = family(Family::Animal, 9, 6, &SMALL);
     let (folder, library) = library(4, Up::Unknown);
     stream(&library, &shapes);
-    // What does not agree by itself is mended first.
+    // A map that disagrees by itself is recomputed first.
     library.mend_maps(COLLECTION).unwrap();
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
     let own = library.disagreements(COLLECTION).unwrap();
     let before = super::super::pipeline::all_labels(&library);
     drop(library);
-    // Of the last shape but one, the map of its first source.
+    // For the last shape but one, the map from its first source.
     let store = Store::open(folder.path()).unwrap();
     let (row, ids) = store
         .catalog()

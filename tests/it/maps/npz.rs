@@ -1,4 +1,4 @@
-//! NumPy's .npz: a zip of .npy arrays, deflated or stored.
+//! Reads NumPy's .npz: a zip of .npy arrays, deflated or stored.
 
 use std::io::Read;
 use std::path::Path;
@@ -15,10 +15,10 @@ fn number(bytes: &[u8], at: usize, size: usize) -> usize {
     usize::try_from(u64::from_le_bytes(word)).unwrap()
 }
 
-/// The array of that name.
+/// The array with this name.
 pub(super) fn read(path: &Path, name: &str) -> Array {
     let zip = std::fs::read(path).unwrap();
-    // The end record, then the central directory it points to.
+    // The end record, then the central directory that it refers to.
     let end = zip.windows(4).rposition(|w| w == b"PK\x05\x06").unwrap();
     let (count, mut at) = (number(&zip, end + 10, 2), number(&zip, end + 16, 4));
     for _ in 0..count {

@@ -1,4 +1,4 @@
-//! `describe --full`: what it writes is what it says, and its timings add up.
+//! Tests `describe --full`: its output matches its files, and its timings add up.
 
 use super::check;
 use crate::harness::{Home, json, skittle, stdout};
@@ -61,7 +61,7 @@ fn the_file_holds_the_operator_and_its_pairs() {
     }
 }
 
-/// Signatures are those of the formulas, whatever batches and kernels they were computed in.
+/// Checks that signatures follow the formulas, for all batches and kernels.
 fn assert_signatures(file: &SafeTensors<'_>, values: &[f64], columns: &[Vec<f64>]) {
     let (n, k) = (columns[0].len(), values.len());
     let times = coseg::descriptors::hks_times(values, 100);
@@ -115,7 +115,8 @@ fn parts_of_the_solver_are_within_its_total() {
         .collect();
     assert!(parts.len() >= 3, "{parts:?}");
     let sum: f64 = parts.iter().map(|n| ms(n)).sum();
-    // All of the solver is within some part; what is not is the time between two readings of a clock.
+    // All stages of the solver are within a stage; the rest is the time between two readings of a
+    // clock.
     let total = ms("spectrum");
     assert!(sum <= total + 1e-6 && sum > 0.5 * total, "{sum} of {total}");
 
@@ -125,7 +126,7 @@ fn parts_of_the_solver_are_within_its_total() {
             .any(|l| l.trim_start().starts_with("spectrum.assemble ")),
         "{text}"
     );
-    // Without --full a description has its stages alone.
+    // Without --full a description has only its own stages.
     let args = ["describe", &mesh, "--k", "40", "--json"];
     let found = json(&home.coseg(&args), 0);
     let names = found["timings_ms"].as_object().unwrap().keys();

@@ -1,6 +1,8 @@
-//! Eigenvalues of ever finer meshes approach those of the surface at the order they should.
+//! Tests that eigenvalues of finer and finer meshes converge to those of the surface with the right
+//! order.
 //!
-//! Linear elements with lumped mass err by O(h²): half the edge, a quarter of the error.
+//! Linear elements with lumped mass have an error of O(h²): half the edge gives a quarter of the
+//! error.
 
 use super::smallest;
 use coseg::mesh::TriMesh;
@@ -8,10 +10,10 @@ use coseg::operators::{Laplacian, Operator, laplacian};
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
 
-/// The least order in h that counts as second.
+/// The least order in h that counts as second order.
 const ORDER: f64 = 1.8;
 
-/// Orders by which errors fall from one mesh to the next of half its edge.
+/// The orders by which errors fall from one mesh to the next with half its edge length.
 fn assert_second_order(name: &str, errors: &[f64]) {
     for pair in errors.windows(2) {
         let order = (pair[0] / pair[1]).log2();
@@ -26,7 +28,7 @@ fn error(operator: &Laplacian, expected: &[f64]) -> f64 {
     pairs.fold(0.0, |worst, (a, b)| worst.max((a - b).abs() / b))
 }
 
-/// A unit sphere: an octahedron, its faces divided `m` times each way.
+/// A unit sphere: an octahedron whose faces are divided `m` times in each direction.
 fn sphere(m: i32) -> TriMesh {
     let mut index = BTreeMap::new();
     let mut mesh = TriMesh::default();
@@ -110,7 +112,7 @@ fn rectangle_with_free_edges_at_second_order() {
 
 #[test]
 fn flat_torus_at_second_order() {
-    // A flat torus does not fit into space as a mesh: its matrices are written down.
+    // A flat torus cannot be embedded in space as a mesh, so its matrices are given explicitly.
     let torus = |m: usize| {
         let h = 1.0 / m as f64;
         let at = |i: usize, j: usize| (i % m) * m + j % m;

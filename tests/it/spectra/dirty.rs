@@ -1,4 +1,4 @@
-//! Meshes as they come: each has a spectrum under every operator, or is refused with a reason.
+//! Tests unprepared meshes: each has a spectrum under every operator, or is refused with a reason.
 
 use super::smallest;
 use crate::harness::messy_files;
@@ -7,13 +7,14 @@ use coseg::operators::{Laplacian, LaplacianError, Operator, laplacian};
 use std::collections::BTreeSet;
 
 const OPERATORS: [Operator; 3] = [Operator::Tufted, Operator::Cotan, Operator::MeshLaplace];
-/// Rows of W sum to zero but for rounding, relative to the row's largest entry.
+/// Rows of W sum to zero up to rounding, relative to the row's largest entry.
 const ROUNDING: f64 = 1e-9;
 const N_PAIRS: usize = 24;
-/// Above so many vertices `mesh-laplace` is looked at, but not solved for: its kernel fills in.
+/// With more vertices, `mesh-laplace` is checked but not solved, because its kernel fills in.
 const MAX_VERTICES: usize = 6_000;
 
-/// Symmetric, rows sum to zero, positive mass; semidefinite is what having a spectrum proves.
+/// Checks symmetry, zero row sums and positive mass; the existence of a spectrum proves
+/// semidefiniteness.
 fn assert_laplacian(name: &str, operator: &Laplacian) {
     let w = &operator.stiffness;
     for (i, row) in w.outer_iterator().enumerate() {
@@ -31,7 +32,7 @@ fn assert_laplacian(name: &str, operator: &Laplacian) {
     assert!(operator.mass.iter().all(positive), "{name}");
 }
 
-/// No weight of the wrong sign: with rows that sum to zero, W is semidefinite (Gershgorin).
+/// No weight has the wrong sign; with zero row sums, W is then semidefinite (Gershgorin).
 fn assert_semidefinite(name: &str, operator: &Laplacian) {
     for (i, row) in operator.stiffness.outer_iterator().enumerate() {
         for (j, x) in row.iter() {
@@ -40,7 +41,7 @@ fn assert_semidefinite(name: &str, operator: &Laplacian) {
     }
 }
 
-/// What a cleaned mesh comes to under each operator; reasons of refusals.
+/// The results of a cleaned mesh under each operator; reasons of refusals.
 fn spectra(name: &str, mesh: &TriMesh) -> Vec<String> {
     let bridges = mesh::bridges(mesh);
     let k = N_PAIRS.min(mesh.vertices.len());
@@ -51,7 +52,7 @@ fn spectra(name: &str, mesh: &TriMesh) -> Vec<String> {
         let operator = match found {
             Ok(operator) => operator,
             Err(e) => {
-                // The default takes all that cleaning lets through.
+                // The default operator accepts all meshes that cleaning accepts.
                 assert_ne!(kind, Operator::Tufted, "{name}: {e}");
                 assert!(!matches!(e, LaplacianError::Empty { .. }), "{name}: {e}");
                 refusals.push(format!("{name}: {e}"));
@@ -63,8 +64,9 @@ fn spectra(name: &str, mesh: &TriMesh) -> Vec<String> {
             assert_semidefinite(&name, &operator);
             continue;
         }
-        // `smallest` checks residuals and orthonormality. What it refuses under the default is a defect; slivers give
-        // the other operators weights so large that a residual may stay above the limit, which it says.
+        // `smallest` checks residuals and orthonormality. A refusal under the default operator is a
+        // defect. Slivers give the other operators weights so large that a residual may stay above
+        // the limit, which is reported.
         let found = match smallest(&operator, k) {
             Ok(found) => found,
             Err(e) => {
@@ -78,7 +80,8 @@ fn spectra(name: &str, mesh: &TriMesh) -> Vec<String> {
             println!("{name}: counted, not proved: {:?}", found.certificate);
             assert_ne!(kind, Operator::Tufted, "{name}: {:?}", found.certificate);
         }
-        // Bridges make one domain; a kernel that ends may still leave out what is far from the rest.
+        // Bridges make one domain; a truncated kernel may still omit parts that are far from the
+        // rest.
         let zeros = found.eigenvalues.iter().filter(|l| **l == 0.0).count();
         assert_eq!(zeros, found.certificate.n_components.min(k), "{name}");
         assert!(
@@ -127,7 +130,8 @@ fn every_messy_file_has_spectra_or_a_named_refusal() {
     assert_eq!(formats.len(), 5, "{formats:?}");
 }
 
-/// A closed strip of `n` squares, `height` high, with caps: the lower, the thinner its triangles.
+/// A closed strip of `n` squares, `height` high, with caps: the lower it is, the thinner its
+/// triangles.
 pub(super) fn drum(n: u32, height: f64) -> TriMesh {
     let mut mesh = TriMesh::default();
     for i in 0..n {
@@ -152,7 +156,8 @@ fn slivers_have_spectra() {
 
 #[test]
 fn needles_and_crossings_have_spectra() {
-    // Two drums through each other's middle, welded at a vertex, and a fin: no manifold.
+    // Two drums that pass through each other's middle, welded at a vertex, and a fin: not a
+    // manifold.
     let mut mesh = drum(24, 0.7);
     let n = mesh.vertices.len() as u32;
     let other = drum(17, 1e-4);

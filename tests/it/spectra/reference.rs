@@ -1,13 +1,14 @@
-//! The tufted Laplacian against robust_laplacian 1.1.0 (Sharp and Crane's own code).
+//! Compares the tufted Laplacian with robust_laplacian 1.1.0 (Sharp and Crane's own code).
 //!
-//! `reference.py` makes the meshes and writes `reference.json`; its first lines say how to run it.
+//! `reference.py` generates the meshes and writes `reference.json`; its first lines explain how to
+//! run it.
 
 use super::smallest;
 use coseg::mesh::TriMesh;
 use coseg::operators::{Operator, laplacian};
 use serde_json::Value;
 
-/// Both mollify, with the same factor but not the same rounding.
+/// Both mollify with the same factor, but with different rounding.
 const AGREE: f64 = 1e-6;
 
 fn numbers(value: &Value) -> Vec<f64> {

@@ -1,4 +1,4 @@
-//! Array files: what is written is read back, and every way a file can be bad is an error.
+//! Tests array files: they read back as written, and every kind of damage is an error.
 
 use super::{PARAMS, description};
 use coseg::pipeline::Description;
@@ -14,7 +14,7 @@ fn open_bytes(bytes: &[u8]) -> Result<MappedDescription, ArrayFileError> {
     MappedDescription::open(&path, bytes.len() as u64, None)
 }
 
-/// Header and data of a file, taken apart without the crate's help.
+/// Header and data of a file, split without the crate's help.
 fn parts(file: &[u8]) -> (Value, Vec<u8>) {
     let length = u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
     let header = serde_json::from_slice(&file[8..8 + length]).expect("JSON");
@@ -74,7 +74,7 @@ fn the_smallest_description_reads_back() {
     }
 }
 
-/// What a reader without our code sees: safetensors, data at a multiple of 64, right shapes.
+/// The view of a reader without our code: safetensors, data at a multiple of 64, right shapes.
 #[test]
 fn the_file_is_plain_safetensors() {
     let description = description(21, 9);
@@ -118,7 +118,7 @@ fn the_file_is_plain_safetensors() {
     assert_eq!(faces, expected);
 }
 
-/// The same through numpy, where there is one.
+/// The same through numpy, if it is installed.
 #[test]
 fn python_reads_the_file_without_our_code() {
     let script = r#"
@@ -189,7 +189,7 @@ fn length_and_digest_are_the_catalogs() {
             "{wrong}"
         );
     }
-    // Swapped for another whole file, here padded to the same length by its parameters.
+    // Replaced by another whole file, padded here to the same length by its parameters.
     assert_eq!(other.len(), file.len());
     std::fs::write(&path, &other).expect("written");
     assert!(matches!(open(length), Err(ArrayFileError::Digest { .. })));
@@ -212,7 +212,7 @@ fn every_flipped_bit_is_noticed() {
             MappedDescription::open(&path, length, Some(digest)).is_err(),
             "byte {at}"
         );
-        // Without the digest nothing may panic, whatever is found.
+        // Without the digest no contents may cause a panic.
         if let Ok(mapped) = MappedDescription::open(&path, length, None) {
             let view = mapped.view();
             assert!(

@@ -1,4 +1,4 @@
-//! The catalog: every row reads back, transactions are whole.
+//! Tests the catalog: every row reads back, and transactions are atomic.
 
 use super::{
     add_shape, collection_id, description, label_version, new_collection, opened, summary,
@@ -244,7 +244,7 @@ fn deleting_takes_what_belongs_to_it_and_nothing_else() -> Result<()> {
     })
 }
 
-/// The rule for names that come back: their events go on where they stopped.
+/// Tests the rule for reused names: their events continue where they stopped.
 #[test]
 fn the_log_of_a_name_outlives_its_collection() -> Result<()> {
     let (_dir, store) = opened();

@@ -1,4 +1,4 @@
-//! Two processes, processes that are killed, and system calls that fail.
+//! Tests two processes, killed processes, and failing system calls.
 
 use super::{add_shape, collection_id};
 use crate::harness::number;
@@ -11,7 +11,7 @@ use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
-/// Tells a child process, which is this binary again, which folder to work on.
+/// Names the folder for a child process, which is this binary again.
 const CHILD_LIBRARY: &str = "COSEG_TEST_STORE_CHILD";
 
 fn child(test: &str, library: &Path) -> (Child, BufReader<ChildStdout>) {
@@ -25,7 +25,7 @@ fn child(test: &str, library: &Path) -> (Child, BufReader<ChildStdout>) {
     (child, BufReader::new(stdout))
 }
 
-/// Reads lines until one says `prefix`, and returns what follows.
+/// Reads lines until one begins with `prefix`, and returns the rest of it.
 fn line_after(lines: &mut impl BufRead, prefix: &str) -> Option<String> {
     let mut line = String::new();
     while lines.read_line(&mut line).expect("readable") > 0 {
@@ -37,7 +37,7 @@ fn line_after(lines: &mut impl BufRead, prefix: &str) -> Option<String> {
     None
 }
 
-/// Not a test of its own: what the killed process does.
+/// Not a test of its own: the work of the killed process.
 #[test]
 fn child_adds_shapes_until_it_is_killed() {
     let Some(library) = std::env::var_os(CHILD_LIBRARY) else {
@@ -90,7 +90,7 @@ fn what_was_acknowledged_survives_a_kill() {
             .expect("opens")
             .parse::<u32>()
             .expect("a count");
-        // One may have become durable and not been heard of.
+        // One commit may have become durable without being reported.
         assert!(
             seen == n_acknowledged || seen == n_acknowledged + 1,
             "{seen} {n_acknowledged}"
@@ -100,7 +100,7 @@ fn what_was_acknowledged_survives_a_kill() {
             line_after(&mut lines, "acknowledged ").expect("goes on");
             n_acknowledged += 1;
         }
-        // The point within an addition is the scheduler's choice, spread by a varying delay.
+        // The scheduler chooses the point within an addition; a varying delay spreads it.
         std::thread::sleep(Duration::from_micros(700 * round));
         process.kill().expect("killed");
         process.wait().expect("ended");
@@ -136,10 +136,10 @@ fn what_was_acknowledged_survives_a_kill() {
     }
 }
 
-/// Shapes the traced child adds.
+/// Number of shapes that the traced child adds.
 const N_TRACED: u32 = 3;
 
-/// Not a test of its own: adds a few shapes, tells what became of each, and ends.
+/// Not a test of its own: adds a few shapes, reports each result, and ends.
 #[test]
 fn child_adds_a_few_shapes() {
     let Some(library) = std::env::var_os(CHILD_LIBRARY) else {
@@ -156,11 +156,11 @@ fn child_adds_a_few_shapes() {
         .n_shapes as u32;
     println!("ready {seen}");
     for seed in seen..seen + N_TRACED {
-        // The same name until it succeeds, as a client would.
+        // The same name until it succeeds, like a client.
         match add_shape(&store, "chairs", &format!("s{seed}"), seed) {
             Ok(_) => println!("acknowledged {seed}"),
             Err(error) => {
-                // Only syncs are made to fail here.
+                // Only syncs fail here.
                 let stopped = store.health().read_only().is_some();
                 assert!(stopped, "{error}");
                 assert!(matches!(error, StoreError::ReadOnly { .. }), "{error}");
@@ -181,9 +181,9 @@ fn child_adds_a_few_shapes() {
     println!("ended");
 }
 
-/// What became of a child one of whose system calls was tampered with.
+/// The result of a child with a manipulated system call.
 struct Traced {
-    /// Shapes that it found.
+    /// Number of shapes that it found.
     n_found: Option<u32>,
     n_acknowledged: u32,
     refused: bool,
@@ -191,7 +191,7 @@ struct Traced {
     tampered: bool,
 }
 
-/// Runs the child with the `n`th call of `call` tampered with, if it makes as many.
+/// Runs the child with the `n`th call of `call` manipulated, if it makes that many.
 fn traced(library: &Path, call: &str, tamper: &str, n: u32) -> Traced {
     let log = tempfile::NamedTempFile::new().expect("a file");
     let output = Command::new("strace")
@@ -223,7 +223,7 @@ fn traced(library: &Path, call: &str, tamper: &str, n: u32) -> Traced {
     }
 }
 
-/// Whether system calls can be tampered with here.
+/// Whether system calls can be manipulated here.
 fn can_trace() -> bool {
     let run = Command::new("strace")
         .args(["-qq", "-o", "/dev/null", "true"])
@@ -235,12 +235,12 @@ fn can_trace() -> bool {
     can
 }
 
-/// What must hold of a library after the child, which acknowledged so many shapes in it.
+/// Checks a library after the child, which acknowledged this number of shapes in it.
 fn assert_whole(library: &Path, n_acknowledged: u32, context: &str) {
     if library.join("catalog.db").exists() {
         let findings = check(library).unwrap_or_default();
         let damage: Vec<_> = findings.iter().filter(|finding| finding.damage).collect();
-        // Before the very first commit there is no catalog yet to speak of.
+        // Before the very first commit no catalog exists.
         assert!(
             damage.is_empty() || n_acknowledged == 0,
             "{context}: {damage:?}"
@@ -275,7 +275,7 @@ fn a_kill_at_any_durable_call_loses_nothing() {
         return;
     }
     let mut n_kills = 0;
-    // Every sync and rename; of the many writes every seventh, unless all are asked for.
+    // Every sync and rename; every seventh of the many writes, unless the environment requests all.
     let each = number("COSEG_TEST_EACH_WRITE", 0) != 0;
     let write_step = if each { 1 } else { 7 };
     for (call, step) in [
@@ -299,14 +299,15 @@ fn a_kill_at_any_durable_call_loses_nothing() {
     assert!(n_kills > 40, "{n_kills}");
 }
 
-/// Kills the process that comes after one that was killed, as it opens what that left and goes on.
+/// Kills the process that follows a killed one, while it opens the library and continues.
 #[test]
 fn a_kill_during_the_recovery_from_a_kill_loses_nothing() {
     if !can_trace() {
         return;
     }
     let n_wanted = number("COSEG_TEST_KILLS", 3) as usize;
-    // In the middle of commits, between the files and their rows, and before; in turn, as long as such calls are made.
+    // In the middle of commits, between the files and their rows, and earlier; in turn, as long as
+    // such calls occur.
     let mut firsts = VecDeque::from([
         ("fdatasync", 5, 1),
         ("rename", 2, 1),
@@ -332,7 +333,7 @@ fn a_kill_during_the_recovery_from_a_kill_loses_nothing() {
                 let seen = two.n_found.unwrap_or(one.n_acknowledged);
                 let n = one.n_acknowledged;
                 assert!(seen == n || seen == n + 1, "{context}: {seen} of {n}");
-                // What was never heard of may be there all the same, once from each.
+                // Unreported shapes may exist too, one from each process.
                 let heard = if two.n_found.is_some() {
                     seen + two.n_acknowledged
                 } else {

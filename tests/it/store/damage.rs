@@ -1,4 +1,4 @@
-//! Damage is found, named, and never served as data; orphans are not damage.
+//! Tests that damage is found, named, and never served as data; orphans are not damage.
 
 use super::{PARAMS, add_shape, collection_id, description};
 use coseg::store::check::check;
@@ -135,7 +135,7 @@ fn damaged_files_are_never_served_and_the_rest_is() {
             .open_description(&whole.object)
             .expect("whole");
     }
-    // Describing again heals it: the good bytes get a name of their own beside the bad ones.
+    // Describing again repairs it: the good bytes get a name of their own beside the bad ones.
     let again = store
         .objects()
         .put_description(refs[1].object.digest, &description(21, 1), PARAMS);
@@ -150,13 +150,13 @@ fn damaged_files_are_never_served_and_the_rest_is() {
     assert_eq!(damage(&library), [""; 0]);
 }
 
-/// Flips one bit at many places of the catalog's file: each is found, or changes nothing that can
-/// be asked for. Nothing panics, and what is read is what was written.
+/// Flips one bit at many places of the catalog's file: each is found, or changes no answer. Nothing
+/// panics, and all data that are read equal those that were written.
 #[test]
 fn a_damaged_catalog_is_found_or_harmless() {
     let (_dir, library) = library();
     let catalog = library.join("catalog.db");
-    // Everything in one file, without a log.
+    // Everything is in one file, without a log.
     let connection = rusqlite::Connection::open(&catalog).expect("opens");
     connection
         .execute_batch("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -169,7 +169,7 @@ fn a_damaged_catalog_is_found_or_harmless() {
         let at = (step * 7_919 + 13) * 31 % good.len();
         let mut bad = good.clone();
         bad[at] ^= 1 << (step % 8);
-        // Every tenth: a block of zeros instead.
+        // Every tenth time it writes a block of zeros instead.
         if step % 10 == 0 {
             let begin = at / 4096 * 4096;
             let end = good.len().min(begin + 4096);
@@ -182,8 +182,8 @@ fn a_damaged_catalog_is_found_or_harmless() {
             assert_eq!(same, whole, "byte {at} changed an answer unnoticed");
         } else {
             n_found += 1;
-            // Some answer or a typed error, never a wrong one. A row that a broken index hides may
-            // seem not to be there, but then nothing is built on that: writes are refused.
+            // Each answer is right or a typed error, never wrong. A row behind a broken index may
+            // seem to be missing, but no write is based on that: writes are refused.
             if let Ok(answers) = dump(&library) {
                 let wrong = answers
                     .iter()
@@ -210,7 +210,7 @@ fn a_damaged_catalog_is_found_or_harmless() {
     }
 }
 
-/// Answers to everything a library asks of the catalog, as lines.
+/// The answers to all queries of the catalog by a library, as lines.
 fn dump(library: &Path) -> Result<Vec<String>, StoreError> {
     let store = Store::open(library)?;
     store.catalog().read(|r| {
@@ -253,7 +253,7 @@ fn rows_that_contradict_each_other_are_named() {
     let (_dir, library) = library();
     let change = |sql: &str| {
         let connection = rusqlite::Connection::open(library.join("catalog.db")).expect("opens");
-        // As a program would that knows nothing of sums and references.
+        // As a program without knowledge of sums and references would do.
         connection
             .execute_batch("PRAGMA foreign_keys = OFF")
             .expect("runs");
@@ -288,7 +288,7 @@ fn rows_that_contradict_each_other_are_named() {
             "{sql}: {found:?}"
         );
     }
-    // People cannot change a row by accident: the sum is not theirs to make.
+    // People cannot change a row by accident, because they do not maintain the sum.
     let connection = rusqlite::Connection::open(library.join("catalog.db")).expect("opens");
     let refused = connection.execute("UPDATE labels SET name = 'leg'", []);
     assert!(
@@ -317,7 +317,7 @@ fn what_another_process_left_is_named_and_swept_after_a_day_not_before() {
     };
     set_old(&old);
     std::fs::write(library.join("tmp/1-1"), "fresh").expect("written");
-    // Put by this process, old by the file's own clock: still about to be committed.
+    // Stored by this process, old by the file's own clock: still about to be committed.
     let pending = store.objects().put_original(b"pending").expect("stored");
     let file = pending.file.clone();
     set_old(&library.join(&file));
@@ -336,7 +336,8 @@ fn what_another_process_left_is_named_and_swept_after_a_day_not_before() {
         b"pending"
     );
 
-    // Nothing refers to it, so the row goes now; the file, when its process ends before it goes, a day after that.
+    // Nothing refers to it, so its row is deleted now; its file is removed a day later if the
+    // process ends first.
     drop(pending);
     assert_eq!(store.sweep_orphans(ORPHAN_AGE).expect("swept"), [""; 0]);
     let row = store
@@ -366,7 +367,7 @@ fn what_shapes_and_queued_items_need_is_not_swept() {
         .catalog()
         .write(|tx| tx.delete_collection(id))
         .expect("deleted");
-    // Its items are still queued: the originals stay, the descriptions go.
+    // Its items are still queued: the originals stay, the descriptions are removed.
     let swept = store.sweep_orphans(Duration::ZERO).expect("swept");
     assert_eq!(swept.len(), 3);
     assert!(

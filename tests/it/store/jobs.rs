@@ -1,4 +1,4 @@
-//! Jobs that were accepted and requests that were answered.
+//! Tests accepted jobs and answered requests.
 
 use super::opened;
 use coseg::store::rows::{ItemStatus, NewJobItem, RequestRow};
@@ -88,7 +88,7 @@ fn answers_are_kept_for_a_day_whatever_the_clock_does() -> Result<()> {
     );
     assert_eq!(catalog.read(|r| r.request("c", "1"))?, Some(row(1, now)));
     assert_eq!(catalog.read(|r| r.request("d", "1"))?, None);
-    // Ten years on in one step, then a day back: nothing is forgotten.
+    // The clock jumps ten years ahead, then a day back: nothing is deleted.
     for jump in [now + 3_650 * DAY, now - DAY] {
         assert_eq!(catalog.write(|tx| tx.purge_requests(jump, 0))?, 0);
         now = jump;

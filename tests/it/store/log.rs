@@ -1,4 +1,5 @@
-//! A catalog whose log is missing, cut, older or another's is refused, never opened as an emptier library.
+//! Tests that a catalog with a missing, cut, older or foreign log is refused, never opened as a
+//! smaller library.
 
 use super::add_shape;
 use coseg::Library;
@@ -25,8 +26,8 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What a process that ends leaves of a library of two shapes, of four, and of six after a clean stop in between: the log
-/// has the last two.
+/// The files of a library of two shapes, of four, and of six after a clean stop in between: the log
+/// contains the last two.
 struct Images {
     dir: tempfile::TempDir,
 }
@@ -57,7 +58,7 @@ impl Images {
         self.dir.path().join(name)
     }
 
-    /// A library to be damaged.
+    /// A library for damaging.
     fn fresh(&self, n: u32) -> PathBuf {
         let library = self.path("damaged");
         let _ = fs::remove_dir_all(&library);
@@ -110,9 +111,9 @@ fn what_a_process_left_that_ended_opens() {
         assert_eq!(damage(&library), [""; 0]);
         let expected: Vec<_> = (0..n).map(|i| format!("s{i}")).collect();
         assert_eq!(names(&library), expected);
-        // And once more, after the clean end of that.
+        // The same again, after a clean end.
         assert_eq!(names(&library), expected);
-        // Closed, it is one file: what is left of the log may go.
+        // Once closed, it is one file: the rest of the log may be deleted.
         for file in [LOG, INDEX] {
             let _ = fs::remove_file(library.join(file));
         }
@@ -140,7 +141,7 @@ fn a_log_that_does_not_hold_what_was_acknowledged_is_refused() {
         log.set_len(length * share / 100).expect("cut");
         library
     };
-    /// What is done, what the error says, and how many shapes a repair can go on with.
+    /// The damage, the error message, and the number of shapes with which a repair can continue.
     type Case<'a> = (&'a str, Box<dyn Fn() -> PathBuf + 'a>, &'a str, Option<u32>);
     let removed = |files: &'static [&'static str]| {
         let images = &images;
@@ -259,7 +260,7 @@ fn a_log_that_does_not_hold_what_was_acknowledged_is_refused() {
             "originals: {} shapes are in the store and not in the catalog",
             6 - n
         );
-        // Where the log is not the catalog's, what they say together is not to be counted.
+        // If the log belongs to another catalog, their combined contents are meaningless.
         if says == "that were acknowledged" {
             assert!(found.contains(&lost), "{what}: {found:?}");
         }
@@ -289,14 +290,14 @@ fn a_catalog_without_a_witness_opens_and_gets_one() {
     assert_eq!(damage(&library), [""; 0]);
     assert_eq!(names(&library).len(), 6);
     assert!(library.join(WITNESS).exists());
-    // One that cannot be read is named, and written anew.
+    // An unreadable witness is reported, and rewritten.
     fs::write(library.join(WITNESS), "coseg-commits 1 x").expect("written");
     let found = damage(&library);
     assert_eq!(found.len(), 1, "{found:?}");
     assert!(found[0].starts_with(WITNESS), "{found:?}");
     assert_eq!(names(&library).len(), 6);
     assert_eq!(damage(&library), [""; 0]);
-    // Without one, a library that lost its log looks like one that is new; what lies in it does not.
+    // Without a witness, a library that lost its log looks like a new one; its object files do not.
     let library = images.fresh(4);
     remove(&library, &[WITNESS, LOG, INDEX]);
     let findings = check(&library).expect("runs");

@@ -1,7 +1,9 @@
-//! Random operations and restarts, against a model in memory: what the store answers is what the model holds.
+//! Compares random operations and restarts with a model in memory: the answers of the store must
+//! equal those of the model.
 //!
-//! `COSEG_TEST_OPERATIONS`, of each of `COSEG_TEST_ROUNDS` libraries, and `COSEG_TEST_SEED`, which counts on from library to
-//! library, make it longer and other; the seed is printed.
+//! `COSEG_TEST_OPERATIONS`, for each of `COSEG_TEST_ROUNDS` libraries, makes the test longer.
+//! `COSEG_TEST_SEED`, which increases from library to library, makes it different; the seed is
+//! printed.
 
 use super::{add_shape, description, label_version, summary};
 use crate::harness::{number, seed};
@@ -12,7 +14,7 @@ use rand::{Rng as _, SeedableRng as _};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// A shape as it must be.
+/// The required state of a shape.
 #[derive(Debug, Clone)]
 struct Known {
     id: ShapeId,
@@ -31,7 +33,7 @@ fn compare(store: &Store, model: &Model, whole: bool, context: &str) {
     let read = store.catalog().read(|r| {
         for (name, sequence) in &model.sequences {
             assert_eq!(r.sequence(name)?, *sequence, "{context}: log of {name}");
-            // The newest, and at the end all: a log only grows.
+            // The newest events, and at the end all of them: a log only grows.
             let from = if whole {
                 0
             } else {
@@ -97,7 +99,7 @@ fn random_operations_agree_with_a_model_across_restarts() {
     }
 }
 
-/// One library, from nothing.
+/// Tests one library, starting empty.
 fn agree(n_operations: u64, seed: u64) {
     println!("{n_operations} operations, COSEG_TEST_SEED={seed}");
     let mut random = rand_pcg::Pcg64Mcg::seed_from_u64(seed);
@@ -117,13 +119,13 @@ fn agree(n_operations: u64, seed: u64) {
         match random.random_range(0..100) {
             0..45 => {
                 n_shapes += 1;
-                // Every tenth a name that is taken, if there is one.
+                // Every tenth time an existing name, if there is one.
                 let taken = pick(&mut random).filter(|_| n_shapes % 10 == 0);
                 let known = taken.is_some();
                 let name = taken.map_or_else(|| format!("s{n_shapes}"), |(name, _)| name);
                 let new = !model.collections.contains_key(&collection);
                 match add_shape(&store, &collection, &name, n_shapes) {
-                    // A name that is taken leaves no trace, not even an event.
+                    // A name that exists leaves no trace, not even an event.
                     Err(StoreError::Exists { .. }) if known => continue,
                     Ok(id) if !known => {
                         let sequence = model.sequences.entry(collection.clone()).or_default();

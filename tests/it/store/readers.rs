@@ -1,4 +1,4 @@
-//! Readers beside a writer, and catalogs that are not ours to read.
+//! Tests readers beside a writer, and files that are not catalogs.
 
 use super::{add_shape, collection_id, opened};
 use coseg::store::{Store, StoreError};
@@ -8,7 +8,7 @@ use std::time::Duration;
 
 type Result<T> = std::result::Result<T, StoreError>;
 
-/// A reader that began before a commit goes on seeing what was, and neither waits for the other.
+/// A reader that began before a commit keeps seeing the old state, and neither waits for the other.
 #[test]
 fn readers_neither_wait_nor_see_half() -> Result<()> {
     let (_dir, store) = opened();

@@ -1,4 +1,4 @@
-//! Files that nothing refers to any more go soon, and none that somebody needs.
+//! Tests that unreferenced files are removed soon, and needed ones never.
 
 use super::{add_shape, collection_id};
 use coseg::store::rows::{NewJobItem, ObjectKind};
@@ -49,10 +49,10 @@ fn space_of_removed_shapes_comes_back_when_nobody_needs_it() {
     assert_eq!(n_files(dir.path()), 6);
     remove(&store, "s1");
     assert_eq!(store.release_unreferenced().expect("released"), 2);
-    // Not while whoever found the rows may be about to open them.
+    // Not while a reader that found the rows may be about to open them.
     let hour = Duration::from_secs(3_600);
     assert_eq!(store.reclaim(hour).expect("looked"), [""; 0]);
-    // Nor while a copy is made, in whichever process.
+    // Nor while any process makes a copy.
     let reading = File::open(dir.path().join("objects")).expect("opens");
     rustix::fs::flock(&reading, rustix::fs::FlockOperation::LockShared).expect("locked");
     assert_eq!(store.reclaim(Duration::ZERO).expect("looked"), [""; 0]);
@@ -62,7 +62,7 @@ fn space_of_removed_shapes_comes_back_when_nobody_needs_it() {
     assert_eq!(store.reclaim(Duration::ZERO).expect("looked"), [""; 0]);
 }
 
-/// The same bytes are added again while their removal is under way.
+/// The same bytes are added again during their removal.
 #[test]
 fn a_file_that_is_about_to_be_named_again_stays() {
     let dir = tempfile::tempdir().expect("a folder");
@@ -79,7 +79,7 @@ fn a_file_that_is_about_to_be_named_again_stays() {
     remove(&store, "a");
     assert_eq!(store.release_unreferenced().expect("released"), 2);
     assert_eq!(find(), None);
-    // Two find it there; one commits, one gives up.
+    // Two writers find it; one commits, one gives up.
     let (first, second) = (
         store.objects().put_original(bytes).expect("stored"),
         store.objects().put_original(bytes).expect("stored"),

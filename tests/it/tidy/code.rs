@@ -1,18 +1,20 @@
-//! The order of modules, purity, `unsafe` and the length of files, by a small lexer for Rust.
+//! Checks the order of modules, purity, `unsafe` and the length of files, with a small lexer for
+//! Rust.
 
-/// The first module of the shell; those before it are pure.
+/// The first module of the shell; the modules before it are pure.
 const FIRST_OF_SHELL: &str = "store";
-/// The one file that may be unsafe: it maps files into memory.
+/// The only file that may be unsafe: it maps files into memory.
 const UNSAFE_FILE: &str = "src/store/mapped.rs";
-/// The one pure file that maps memory, without a file.
+/// The only pure file that maps memory, without a file.
 const MEMORY_FILE: &str = "crates/geometry/src/linalg/basis.rs";
-/// The one pure file that reads JSON: that of a file format.
+/// The only pure file that reads JSON: that of a file format.
 const JSON_FILE: &str = "crates/geometry/src/mesh/parse/gltf/document.rs";
-/// Beyond this a source file must be split.
+/// Maximum number of lines of a source file.
 const MAX_LINES: usize = 700;
-/// What a pure module may not name of the standard library: files, clocks, the process and its surroundings.
+/// Modules of the standard library that a pure module may not name: files, clocks, the process and
+/// its environment.
 const IMPURE_STD: [&str; 7] = ["env", "fs", "net", "os", "process", "thread", "time"];
-/// Crates for files, sockets, logs and formats, which pure modules do without.
+/// Crates for files, sockets, logs and formats, which pure modules may not use.
 const IMPURE_CRATES: [&str; 13] = [
     "clap",
     "indicatif",
@@ -71,7 +73,7 @@ impl Flow {
     }
 }
 
-/// What is wrong with a file of the crate, or of `tests`.
+/// The faults of a file of the crate, or of `tests`.
 pub(super) fn code_faults(flow: &Flow, file: &str, text: &str) -> Vec<String> {
     let tokens = tokens(text);
     let mut faults = Vec::new();
@@ -92,7 +94,7 @@ pub(super) fn code_faults(flow: &Flow, file: &str, text: &str) -> Vec<String> {
     let Some(rank) = flow.modules.iter().position(|m| m == path[0]) else {
         return faults;
     };
-    // `super` so often reaches the root of the crate.
+    // This number of `super` reaches the root of the crate.
     let depth = path.len() - usize::from(path.last() == Some(&"mod"));
     for name in named_at_root(&tokens, depth) {
         if flow.rank(name) > Some(rank) {
@@ -136,7 +138,7 @@ fn impurities(tokens: &[String], mut fault: impl FnMut(String)) {
     }
 }
 
-/// The names that follow the root of the crate, be it `crate` or enough `super`s.
+/// The names that follow the root of the crate: `crate`, or enough `super`s.
 fn named_at_root(tokens: &[String], depth: usize) -> Vec<&str> {
     let mut names = Vec::new();
     let mut i = 0;
@@ -191,7 +193,7 @@ fn first_names(tokens: &[String], at: usize) -> Vec<&str> {
     names
 }
 
-/// Names, numbers, `::` and other single characters; no comments, no strings.
+/// Names, numbers, `::` and other single characters, without comments and strings.
 fn tokens(text: &str) -> Vec<String> {
     let chars: Vec<char> = text.chars().collect();
     let is_word = |c: char| c.is_alphanumeric() || c == '_';
@@ -294,7 +296,7 @@ fn the_flow_is_read_from_the_root_of_the_library() {
     assert_eq!(flow.pure(), ["mesh", "labels", "pipeline"]);
 }
 
-/// Sources that must be found at fault, each for one reason.
+/// Sources with one fault each, which must be found.
 #[test]
 fn planted_faults_of_the_code_are_found() {
     let flow = Flow::read("src", SAMPLE);

@@ -1,4 +1,4 @@
-//! Links, paths and commands that the documents name.
+//! Checks the links, paths and commands in documents.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ const TOP: [&str; 9] = [
     ".ci/",
 ];
 
-/// Links of a document, and paths named in a document or a source, that lead nowhere.
+/// Broken links of a document, and missing paths named in a document or a source.
 pub(super) fn link_faults(root: &Path, file: &str, text: &str) -> Vec<String> {
     let mut faults = Vec::new();
     if file.ends_with(".rs") {
@@ -85,7 +85,7 @@ fn broken(root: &Path, file: &str, target: &str) -> Option<&'static str> {
     (!found).then_some("which has no such heading")
 }
 
-/// The anchor of a heading, as forges make it.
+/// The anchor of a heading, in the form of code forges.
 fn slug(heading: &str) -> String {
     let text = heading.trim_start_matches('#').trim().to_lowercase();
     let kept = text
@@ -120,7 +120,7 @@ pub(super) fn commands_in(text: &str) -> Vec<(String, Vec<String>)> {
     commands
 }
 
-/// Whether a help text has a flag, and not only one that begins like it.
+/// Whether a help text has a flag, rather than one that begins with it.
 pub(super) fn has_flag(help: &str, flag: &str) -> bool {
     let goes_on = |c: char| c.is_alphanumeric() || c == '-';
     help.match_indices(flag)
@@ -168,7 +168,8 @@ fn planted_faults_of_documents_are_found() {
 
 #[test]
 fn commands_are_found_in_shell_blocks_only() {
-    let text = "coseg no\n```sh\ncoseg add x --up +y   # --no\n  cargo run --release -- demo\nls\n```\n\
+    let text = "coseg no\n```sh\ncoseg add x --up +y   # --no\n  cargo run --release -- \
+                demo\nls\n```\n\
                 ```python\ncoseg no\n```\n";
     let expected = [
         ("add".to_owned(), vec!["--up".to_owned()]),

@@ -1,4 +1,4 @@
-//! Figures that the README takes from the pages that measured them.
+//! Checks figures that the README takes from the pages with the measurements.
 
 /// Cells of the rows of all tables of a text, without their marks: `**0.860** (0.018)` is `0.860`.
 fn rows(text: &str) -> Vec<Vec<String>> {
@@ -15,7 +15,7 @@ fn rows(text: &str) -> Vec<Vec<String>> {
         .collect()
 }
 
-/// The number that a cell begins with.
+/// The number at the beginning of a cell.
 fn number(cell: &str) -> Option<&str> {
     let first = cell.split_whitespace().next()?;
     (first.parse::<f64>().is_ok() && first.contains('.')).then_some(first)
@@ -25,8 +25,8 @@ fn numbers(row: &[String]) -> Vec<&str> {
     row.iter().filter_map(|cell| number(cell)).collect()
 }
 
-/// Rows of the README's table of accuracy that differ from those of the page, and what is wrong
-/// with the page itself.
+/// Rows of the README's table of accuracy that differ from those of the page, and faults of the
+/// page itself.
 pub(super) fn accuracy_faults(readme: &str, page: &str) -> Vec<String> {
     let heading = "0 labelled";
     let section = |text: &str, title: &str| {
@@ -76,7 +76,7 @@ pub(super) fn accuracy_faults(readme: &str, page: &str) -> Vec<String> {
     faults
 }
 
-/// The family that `coseg demo` makes up, where the README names it.
+/// The family of `coseg demo`, at the places where the README names it.
 pub(super) fn demo_faults(readme: &str, help: &str) -> Vec<String> {
     let family = help
         .split_once("[default: ")
@@ -92,12 +92,17 @@ pub(super) fn demo_faults(readme: &str, help: &str) -> Vec<String> {
 
 #[test]
 fn planted_faults_of_figures_are_found() {
-    let page = "# A\n\n## Reached\n\n| category | parts | 0 labelled | 1 |\n| --- | --- | --- | --- |\n\
-                | Chair | 4 | 0.873 (0.000) | 0.960 (0.001) |\n| mean of 10 | | **0.860** (0.018) | **0.909** (0.004) |\n\n\
-                ## Against others, on the same descriptors\n\n| category | streamed | batch |\n| --- | --- | --- |\n\
+    let page = "# A\n\n## Reached\n\n| category | parts | 0 labelled | 1 |\n\
+                | --- | --- | --- | --- |\n\
+                | Chair | 4 | 0.873 (0.000) | 0.960 (0.001) |\n\
+                | mean of 10 | | **0.860** (0.018) | **0.909** (0.004) |\n\n\
+                ## Against others, on the same descriptors\n\n\
+                | category | streamed | batch |\n| --- | --- | --- |\n\
                 | Chair | **0.873** | 0.966 |\n\n## Else\n\n| Chair | 0.1 | 0.2 |\n";
-    let readme = "# R\n\n## Measured\n\n| set | shapes | 0 labelled | 1 |\n| --- | --- | --- | --- |\n\
-                  | P: mean of 10 | 20 each | 0.860 | 0.909 |\n| of these: Chair | 20 | 0.873 | 0.960 |\n";
+    let readme = "# R\n\n## Measured\n\n| set | shapes | 0 labelled | 1 |\n\
+                  | --- | --- | --- | --- |\n\
+                  | P: mean of 10 | 20 each | 0.860 | 0.909 |\n\
+                  | of these: Chair | 20 | 0.873 | 0.960 |\n";
     assert_eq!(accuracy_faults(readme, page), Vec::<String>::new());
     for (readme, page) in [
         (readme.replace("0.873 |", "0.97 |"), page.to_owned()),

@@ -1,8 +1,8 @@
 //! Computes distances along the surface to sixty spread samples; they tell central points from
 //! extremities.
 //!
-//! Average geodesic distance after Hilaga, Shinagawa, Kohmura and Kunii 2001, *Topology Matching for
-//! Fully Automatic Similarity Estimation of 3D Shapes*, with farthest-point samples.
+//! Average geodesic distance after Hilaga, Shinagawa, Kohmura and Kunii 2001, *Topology Matching
+//! for Fully Automatic Similarity Estimation of 3D Shapes*, with farthest-point samples.
 
 use super::quantile;
 use crate::mesh::geodesic::Distances;

@@ -28,8 +28,8 @@ use crate::mesh::{Bridge, DualGraph, FaceGeometry, TriMesh};
 /// Names and widths of the groups of face descriptors, in column order.
 ///
 /// - `sdf`: log shape diameter, 2 × its area rank
-/// - `agd`: average geodesic distance between its 1st and 99th percentile, 3 × its area rank, and over
-///   its minimum
+/// - `agd`: average geodesic distance between its 1st and 99th percentile, 3 × its area rank, and
+///   over its minimum
 /// - `gc`: share of the area within seven geodesic radii
 /// - `q`: quantiles of the geodesic distance over the mean of the largest
 /// - `pc`: local principal components at three radii

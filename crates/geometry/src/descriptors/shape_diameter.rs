@@ -1,7 +1,7 @@
 //! Measures the thickness of a shape at each face by rays that are cast inward.
 //!
-//! Shapira, Shamir and Cohen-Or 2008, *Consistent mesh partitioning and skeletonisation using the shape
-//! diameter function*.
+//! Shapira, Shamir and Cohen-Or 2008, *Consistent mesh partitioning and skeletonisation using the
+//! shape diameter function*.
 
 use super::quantile;
 use crate::mesh::{Bvh, FaceGeometry, Search, TriMesh, add, cross, dot, scale, sub, unit};

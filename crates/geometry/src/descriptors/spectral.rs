@@ -1,11 +1,11 @@
 //! Computes descriptors of points (heat and wave kernel signatures, global point signature) and of
 //! the shape (ShapeDNA) from eigenpairs of the Laplacian.
 //!
-//! Sun, Ovsjanikov and Guibas 2009, *A Concise and Provably Informative Multi-Scale Signature Based on
-//! Heat Diffusion*; Aubry, Schlickewei and Cremers 2011, *The Wave Kernel Signature*; Rustamov 2007,
-//! *Laplace-Beltrami Eigenfunctions for Deformation Invariant Shape Representation*; Reuter, Wolter and
-//! Peinecke 2006, *Laplace-Beltrami Spectra as Shape-DNA*. Sums of squares of eigenvectors depend
-//! neither on their signs nor on the basis of an eigenspace.
+//! Sun, Ovsjanikov and Guibas 2009, *A Concise and Provably Informative Multi-Scale Signature Based
+//! on Heat Diffusion*; Aubry, Schlickewei and Cremers 2011, *The Wave Kernel Signature*; Rustamov
+//! 2007, *Laplace-Beltrami Eigenfunctions for Deformation Invariant Shape Representation*; Reuter,
+//! Wolter and Peinecke 2006, *Laplace-Beltrami Spectra as Shape-DNA*. Sums of squares of
+//! eigenvectors depend neither on their signs nor on the basis of an eigenspace.
 
 use crate::linalg::squares::SquareWeights;
 use nalgebra::DMatrix;

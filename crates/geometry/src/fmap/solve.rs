@@ -34,7 +34,8 @@ pub struct Energy {
 pub enum SolveError {
     /// Neither probes nor mask determine an entry.
     #[error(
-        "row {row} of the map is not determined: give more probe functions or a positive mask weight"
+        "row {row} of the map is not determined: give more probe functions or a positive mask \
+         weight"
     )]
     Undetermined {
         /// Row of C.
@@ -42,7 +43,8 @@ pub enum SolveError {
     },
     /// Conjugate gradients stopped before the residual was small.
     #[error(
-        "the residual is {residual:e} of the right side after {iterations} iterations, the limit is {limit:e}"
+        "the residual is {residual:e} of the right side after {iterations} iterations, the limit \
+         is {limit:e}"
     )]
     Slow {
         /// Relative residual.

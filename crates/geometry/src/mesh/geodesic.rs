@@ -1,7 +1,7 @@
 //! Computes shortest paths along the edges of a mesh by Dijkstra's algorithm.
 //!
-//! Edge paths overestimate true geodesics by up to a fifth on regular meshes. The descriptors compare
-//! distances with each other within one mesh, where that cancels.
+//! Edge paths overestimate true geodesics by up to a fifth on regular meshes. The descriptors
+//! compare distances with each other within one mesh, where that cancels.
 
 use super::adjacency::EdgeFaces;
 use super::{Bridge, TriMesh, distance};

@@ -1,7 +1,8 @@
 //! Divides a surface into about eighty patches that are equally spread and end at creases.
 //!
-//! Farthest-point seeds on the dual graph, where crossing a crease costs extra, then two Lloyd steps.
-//! Patches are the unit in which parts are found: their boundaries contain those of the parts.
+//! Farthest-point seeds on the dual graph, where crossing a crease costs extra, then two Lloyd
+//! steps. Patches are the unit in which parts are found: their boundaries contain those of the
+//! parts.
 
 use crate::mesh::geodesic::Distances;
 use crate::mesh::{DualEdge, DualGraph, FaceGeometry, TriMesh, add, distance, scale};

@@ -161,15 +161,16 @@ mod tests {
         }
         assert_eq!(
             message(b"PK\x03\x04\x14\0\0\0", Format::Obj),
-            "the file is a ZIP archive (or a 3MF, USDZ or office file), not an OBJ mesh: unpack it and take \
-             the mesh that is in it, as one of .obj, .off, .ply, .stl, .glb, .gltf"
+            "the file is a ZIP archive (or a 3MF, USDZ or office file), not an OBJ mesh: unpack \
+             it and take the mesh that is in it, as one of .obj, .off, .ply, .stl, .glb, .gltf"
         );
         assert_eq!(
             message(
                 b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
                 Format::Obj
             ),
-            "the file is a Git LFS pointer, not an OBJ mesh: get the file itself with `git lfs pull`"
+            "the file is a Git LFS pointer, not an OBJ mesh: get the file itself with `git lfs \
+             pull`"
         );
         assert_eq!(
             message(b"ply\nformat ascii 1.0\n", Format::Obj),

@@ -44,7 +44,8 @@ pub(super) fn json(nodes: &str, primitives: &str, accessors: &str, more: &str) -
         "accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3"}},
         {{"bufferView":1,"componentType":5121,"count":6,"type":"SCALAR"}}{accessors}],
         "bufferViews":[{{"buffer":0,"byteLength":48}},{{"buffer":0,"byteOffset":48,"byteLength":6}},
-        {{"buffer":0,"byteOffset":56,"byteLength":2}},{{"buffer":0,"byteOffset":60,"byteLength":12}}],
+        {{"buffer":0,"byteOffset":56,"byteLength":2}},
+            {{"buffer":0,"byteOffset":60,"byteLength":12}}],
         "buffers":[{{"byteLength":72}}]{more}}}"#
     )
 }
@@ -172,8 +173,9 @@ fn json_alone_with_a_data_uri() {
     for (uri, message) in [
         (
             "scene.bin",
-            "buffer 0 is in another file (\"scene.bin\"), which is not sent along: `coseg add` and the clients pack \
-             both into one when they are given the path; or export a single .glb",
+            "buffer 0 is in another file (\"scene.bin\"), which is not sent along: `coseg add` \
+             and the clients pack both into one when they are given the path; or export a single \
+             .glb",
         ),
         (
             "data:;base64,AAA*",
@@ -232,7 +234,9 @@ fn gltf_errors_name_the_place_and_the_value() {
         ),
         (
             message(NODE, r#"{"attributes":{"POSITION":9}}"#, "", ""),
-            "meshes[0].primitives[0].attributes.POSITION names accessor 9, but the file has 2".into(),
+            "meshes[0].primitives[0].attributes.POSITION names accessor 9, but the file has \
+             2"
+            .into(),
         ),
         (
             message(NODE, r#"{"attributes":{"POSITION":1}}"#, "", ""),
@@ -247,8 +251,14 @@ fn gltf_errors_name_the_place_and_the_value() {
             "a primitive of triangles has 4 corners, which is no multiple of 3".into(),
         ),
         (
-            message(NODE, SQUARE, "", r#","extensionsRequired":["KHR_draco_mesh_compression"]"#),
-            "a file that requires KHR_draco_mesh_compression is not read, export it without that extension"
+            message(
+                NODE,
+                SQUARE,
+                "",
+                r#","extensionsRequired":["KHR_draco_mesh_compression"]"#,
+            ),
+            "a file that requires KHR_draco_mesh_compression is not read, export it without that \
+             extension"
                 .into(),
         ),
     ] {
@@ -281,12 +291,14 @@ fn gltf_errors_name_the_place_and_the_value() {
             "accessors[2].componentType is 77, which glTF does not know",
         ),
         (
-            r#""componentType":5126,"count":4,"type":"VEC3","sparse":{"count":5,"indices":{"bufferView":2,
+            r#""componentType":5126,"count":4,"type":"VEC3",
+                "sparse":{"count":5,"indices":{"bufferView":2,
             "componentType":5123},"values":{"bufferView":3}}"#,
             "accessor 2 replaces 5 entries, but has 4",
         ),
         (
-            r#""componentType":5126,"count":3,"type":"VEC3","sparse":{"count":1,"indices":{"bufferView":2,
+            r#""componentType":5126,"count":3,"type":"VEC3",
+                "sparse":{"count":1,"indices":{"bufferView":2,
             "componentType":5123},"values":{"bufferView":3}}"#,
             "accessor 2 replaces entry 3, but has 3",
         ),

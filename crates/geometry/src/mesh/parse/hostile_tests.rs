@@ -107,28 +107,41 @@ proptest! {
     fn any_counts_and_types_of_a_ply_are_refused_or_read(
         counts in (0..9u64, 0..9u64),
         types in prop::collection::vec(
-            prop::sample::select(&["char", "uchar", "short", "ushort", "int", "uint", "float", "double"][..]),
+            prop::sample::select(
+                &["char", "uchar", "short", "ushort", "int", "uint", "float", "double"][..],
+            ),
             6,
         ),
-        encoding in prop::sample::select(&["ascii", "binary_little_endian", "binary_big_endian"][..]),
+        encoding in prop::sample::select(
+            &["ascii", "binary_little_endian", "binary_big_endian"][..],
+        ),
         body in prop::collection::vec(any::<u8>(), 0..200),
     ) {
         let [x, y, z, n, i, label] = &types[..] else { unreachable!() };
         let (vertices, faces) = counts;
         let mut bytes = format!(
-            "ply\nformat {encoding} 1.0\nelement vertex {vertices}\nproperty {x} x\nproperty {y} y\n\
-             property {z} z\nelement face {faces}\nproperty list {n} {i} vertex_indices\n\
+            "ply\nformat {encoding} 1.0\nelement vertex {vertices}\nproperty {x} x\n\
+             property {y} y\nproperty {z} z\nelement face {faces}\nproperty list {n} {i} \
+             vertex_indices\n\
              property {label} label\nend_header\n"
         )
         .into_bytes();
-        bytes.extend(body.iter().map(|b| if encoding == "ascii" { b"0123456789 \n"[*b as usize % 12] } else { b % 8 }));
+        bytes.extend(body.iter().map(|b| match encoding {
+            "ascii" => b"0123456789 \n"[*b as usize % 12],
+            _ => b % 8,
+        }));
         check(&bytes, Format::Ply);
     }
 
     #[test]
     fn any_numbers_in_a_gltf_are_refused_or_read(
         numbers in prop::collection::vec(
-            prop::sample::select(&["0", "1", "2", "4", "6", "48", "4294967295", "18446744073709551615", "-1", "1e3"][..]),
+            prop::sample::select(
+                &[
+                    "0", "1", "2", "4", "6", "48", "4294967295", "18446744073709551615", "-1",
+                    "1e3",
+                ][..],
+            ),
             12,
         ),
         places in prop::collection::vec((0..24usize).prop_map(|i| i), 12),

@@ -37,7 +37,8 @@ pub enum ParseError {
     #[error("the file has no faces")]
     NoFaces,
     #[error(
-        "the file has no faces, but {n_unread} statements that are not read: the first is \"{found}\" in line {line}"
+        "the file has no faces, but {n_unread} statements that are not read: the first \
+         is \"{found}\" in line {line}"
     )]
     OnlyUnread {
         n_unread: usize,
@@ -80,7 +81,7 @@ pub enum ParseError {
     TooManyTriangles,
     #[error("the file begins with \"{found}\", which is not {format} header")]
     BadHeader { found: String, format: &'static str },
-    #[error("line {line}: \"{found}\" is no line of a {what}")]
+    #[error("line {line}: \"{found}\" is not a line of a {what}")]
     BadLine {
         line: usize,
         found: String,
@@ -103,14 +104,15 @@ pub enum ParseError {
         declared: u64,
         found: u64,
     },
-    #[error("line {line} goes on after the {declared} faces the header declares")]
+    #[error("line {line} follows the {declared} faces that the header declares")]
     Trailing { line: usize, declared: u64 },
     #[error("line {line} ends before all {declared} properties of its row are given")]
     ShortRow { line: usize, declared: usize },
-    #[error("the file goes on for {n_bytes} bytes after what its header declares")]
+    #[error("the file has {n_bytes} bytes beyond the data that its header declares")]
     TrailingBytes { n_bytes: usize },
     #[error(
-        "the header declares {declared} triangles, which take {expected} bytes, but the file has {n_bytes}"
+        "the header declares {declared} triangles, which take {expected} bytes, but the file has \
+         {n_bytes}"
     )]
     StlLength {
         declared: usize,

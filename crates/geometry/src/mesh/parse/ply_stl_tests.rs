@@ -9,7 +9,8 @@ fn stl(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     parse(bytes, Format::Stl)
 }
 
-const HEADER: &str = "comment made by hand\nobj_info nothing\nelement camera 1\nproperty list uchar short pose\n\
+const HEADER: &str = "comment made by hand\nobj_info nothing\nelement camera 1\n\
+    property list uchar short pose\n\
     element vertex 4\nproperty uchar red\nproperty float x\nproperty double y\nproperty short z\n\
     element face 2\nproperty list uint8 uint8 flags\nproperty list uchar int vertex_indices\n\
     property ushort label\nelement edge 1\nproperty int vertex1\nend_header\n";
@@ -77,7 +78,8 @@ fn ply_is_read_in_all_encodings_whatever_else_it_holds() {
     }
 }
 
-const BODY: &str = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n\
+const BODY: &str = "element vertex 3\nproperty float x\nproperty float y\n\
+    property float z\nelement face 1\n\
     property list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
 
 #[test]
@@ -114,15 +116,15 @@ fn ply_errors_name_the_place_and_the_value() {
         ),
         (
             "ply\nformat utf7 1.0\nend_header\n".to_owned(),
-            "line 2: \"format utf7 1.0\" is no line of a PLY header",
+            "line 2: \"format utf7 1.0\" is not a line of a PLY header",
         ),
         (
             with("float x", "quad x"),
-            "line 4: \"property quad x\" is no line of a PLY header",
+            "line 4: \"property quad x\" is not a line of a PLY header",
         ),
         (
             with("vertex 3", "vertex many"),
-            "line 3: \"element vertex many\" is no line of a PLY header",
+            "line 3: \"element vertex many\" is not a line of a PLY header",
         ),
         (
             with("vertex 3", "vertex 3000000000"),
@@ -182,11 +184,12 @@ fn ply_errors_name_the_place_and_the_value() {
         ),
         (
             with("property float z", "property float z\nproperty float x"),
-            "a header that declares the same element or property twice is not read, only one of each name",
+            "a header that declares the same element or property twice is not read, only one of \
+             each name",
         ),
         (
             with("3 0 1 2\n", "3 0 1 2\n3 2 1 0\n"),
-            "the file goes on for 7 bytes after what its header declares",
+            "the file has 7 bytes beyond the data that its header declares",
         ),
     ] {
         assert_eq!(
@@ -269,7 +272,7 @@ fn stl_errors_name_the_place_and_the_value() {
         (b"solid\nendsolid\n".to_vec(), "the file has no faces"),
         (
             text.replace("endsolid", "").into_bytes(),
-            "line 16: \"a facet\" is no line of a text STL",
+            "line 16: \"a facet\" is not a line of a text STL",
         ),
         (
             text.split("endsolid").next().unwrap().into(),
@@ -327,6 +330,6 @@ fn text_stl_may_have_several_statements_on_a_line() {
         stl(text.replacen("endfacet", "end facet", 1).as_bytes())
             .unwrap_err()
             .to_string(),
-        "line 8: \"end facet\" is no line of a text STL"
+        "line 8: \"end facet\" is not a line of a text STL"
     );
 }

@@ -69,7 +69,8 @@ fn obj_errors_name_the_place_and_the_value() {
         ("\n# nothing\n", "the file has no faces"),
         (
             "v 0 0 0\np 1\nl 1 1\n",
-            "the file has no faces, but 2 statements that are not read: the first is \"p 1\" in line 2",
+            "the file has no faces, but 2 statements that are not read: the first is \"p 1\" in \
+             line 2",
         ),
         (
             "v 0 0\nf 1 1 1\n",
@@ -221,7 +222,7 @@ fn off_errors_name_the_place_and_the_value() {
         ),
         (
             "OFF\n1 1 0\n0 0 0\n3 0 0 0\n3 0 0 0\n",
-            "line 5 goes on after the 1 faces the header declares",
+            "line 5 follows the 1 faces that the header declares",
         ),
         (
             "OFF\n1 1 0\n0 0 0\n3 0 0\n",
@@ -290,9 +291,12 @@ fn obj_geometry_that_is_not_read_is_counted() {
 /// Every text format, with all line ends and in all Unicode encodings.
 #[test]
 fn texts_are_read_in_every_encoding_and_with_every_line_end() {
-    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
-               element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
-    let stl = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n\
+    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n\
+               property float y\nproperty float z\n\
+               element face 1\nproperty list uchar int vertex_index\nend_header\n0 0 0\n1 0 0\n\
+               0 1 0\n3 0 1 2\n";
+    let stl = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\n\
+               vertex 0 1 0\nendloop\n\
                endfacet\nendsolid x\n";
     for (format, text) in [
         (Format::Obj, "# x\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 \\\n2 3\n"),

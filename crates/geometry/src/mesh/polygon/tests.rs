@@ -94,7 +94,8 @@ fn check(vertices: &[[f64; 3]], start: usize, wanted_area: f64) -> Result<(), St
     match faults.iter().find(|(wrong, _)| *wrong) {
         None => Ok(()),
         Some((_, what)) => Err(format!(
-            "from corner {start}, {what}: area {found} for {wanted_area}, {kind:?}, {triangles:?} of {vertices:?}"
+            "from corner {start}, {what}: area {found} for {wanted_area}, {kind:?}, {triangles:?} \
+             of {vertices:?}"
         )),
     }
 }
@@ -454,7 +455,10 @@ proptest! {
 
     #[test]
     fn anything_gives_as_many_triangles_as_its_fan(
-        vertices in prop::collection::vec(prop::array::uniform3((-3..3_i32).prop_map(f64::from)), 1..12),
+        vertices in prop::collection::vec(
+            prop::array::uniform3((-3..3_i32).prop_map(f64::from)),
+            1..12,
+        ),
     ) {
         let (triangles, kind) = of_vertices(&vertices, 0);
         let n = vertices.len() as u32;

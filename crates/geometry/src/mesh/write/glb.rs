@@ -129,7 +129,8 @@ pub fn glb<P: AsRef<[u32]>>(
         binary.len()
     );
     let mut accessors = format!(
-        "{{\"bufferView\":0,\"componentType\":5126,\"count\":{},\"type\":\"VEC3\",\"min\":{},\"max\":{}}}",
+        "{{\"bufferView\":0,\"componentType\":5126,\"count\":{},\"type\":\"VEC3\",\
+         \"min\":{},\"max\":{}}}",
         vertices.len(),
         triple(low.map(f64::from)),
         triple(high.map(f64::from)),
@@ -178,7 +179,8 @@ pub fn glb<P: AsRef<[u32]>>(
         append(
             &mut materials,
             format_args!(
-                "{comma}{{\"name\":{},\"doubleSided\":true,\"pbrMetallicRoughness\":{{\"baseColorFactor\":\
+                "{comma}{{\"name\":{},\"doubleSided\":true,\
+                 \"pbrMetallicRoughness\":{{\"baseColorFactor\":\
                  [{r:.6},{g:.6},{b:.6},1.0],\"metallicFactor\":0.0,\"roughnessFactor\":0.8}}}}",
                 quoted(&name)
             ),
@@ -208,7 +210,8 @@ pub fn glb<P: AsRef<[u32]>>(
     let mut json = String::new();
     let _ = write!(
         json,
-        "{{\"asset\":{{\"version\":\"2.0\",\"generator\":\"coseg\"}},\"scene\":0,\"scenes\":[{{\"nodes\":[0]}}],\
+        "{{\"asset\":{{\"version\":\"2.0\",\"generator\":\"coseg\"}},\
+         \"scene\":0,\"scenes\":[{{\"nodes\":[0]}}],\
          \"nodes\":[{node}],\"meshes\":[{{\"name\":{},\"primitives\":[{primitives}]}}],\
          \"materials\":[{materials}],\"accessors\":[{accessors}],\"bufferViews\":[{views}],\
          \"buffers\":[{{\"byteLength\":{}}}]}}",

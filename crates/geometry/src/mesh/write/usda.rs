@@ -89,7 +89,8 @@ pub fn usda<P: AsRef<[u32]>>(
         append(
             &mut out,
             format_args!(
-                "    double xformOp:{turn}\n    uniform token[] xformOpOrder = [\"xformOp:{operation}\"]\n\n"
+                "    double xformOp:{turn}\n    uniform token[] xformOpOrder = \
+                 [\"xformOp:{operation}\"]\n\n"
             ),
         );
     }
@@ -107,8 +108,9 @@ pub fn usda<P: AsRef<[u32]>>(
     out.push_str("\n        int[] primvars:label = ");
     list(&mut out, labels);
     out.push_str(
-        " (\n            interpolation = \"uniform\"\n        )\n        uniform token subdivisionScheme = \"none\"\n        \
-         uniform token subsetFamily:materialBind:familyType = \"partition\"\n",
+        " (\n            interpolation = \"uniform\"\n        )\n        uniform token \
+         subdivisionScheme = \"none\"\n        uniform token subsetFamily:materialBind:familyType \
+         = \"partition\"\n",
     );
     let mut materials = String::new();
     for (label, members) in by_label(labels) {
@@ -117,8 +119,9 @@ pub fn usda<P: AsRef<[u32]>>(
         append(
             &mut out,
             format_args!(
-                "\n        def GeomSubset \"{name}\" (\n            prepend apiSchemas = [\"MaterialBindingAPI\"]\n        \
-                 )\n        {{\n            uniform token elementType = \"face\"\n            \
+                "\n        def GeomSubset \"{name}\" (\n            prepend apiSchemas = \
+                 [\"MaterialBindingAPI\"]\n        )\n        {{\n            uniform token \
+                 elementType = \"face\"\n            \
                  uniform token familyName = \"materialBind\"\n            int[] indices = "
             ),
         );
@@ -135,9 +138,10 @@ pub fn usda<P: AsRef<[u32]>>(
             &mut materials,
             format_args!(
                 "\n        def Material \"{name}\"\n        {{\n            \
-                 token outputs:surface.connect = </{root}/Materials/{name}/Surface.outputs:surface>\n\n            \
-                 def Shader \"Surface\"\n            {{\n                \
-                 uniform token info:id = \"UsdPreviewSurface\"\n                \
+                 token outputs:surface.connect = \
+                 </{root}/Materials/{name}/Surface.outputs:surface>\n\n            \
+                 def Shader \"Surface\"\n            {{\n                uniform token info:id \
+                 = \"UsdPreviewSurface\"\n                \
                  color3f inputs:diffuseColor = ({r:.4}, {g:.4}, {b:.4})\n                \
                  token outputs:surface\n            }}\n        }}\n"
             ),

@@ -349,8 +349,8 @@ fn data_uri(uri: &str, location: &str) -> Result<Vec<u8>, ParseError> {
     if !is_data {
         let shown = shown(uri.as_bytes());
         let why = format!(
-            "is in another file (\"{shown}\"), which is not sent along: `coseg add` and the clients pack \
-             both into one when they are given the path; or export a single .glb"
+            "is in another file (\"{shown}\"), which is not sent along: `coseg add` and the \
+             clients pack both into one when they are given the path; or export a single .glb"
         );
         return Err(fault(location, why));
     }

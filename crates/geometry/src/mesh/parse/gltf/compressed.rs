@@ -30,7 +30,8 @@ pub(super) fn decode(view: &Compressed, bytes: &[u8]) -> Result<Vec<u8>, String>
         .saturating_add(ALLOWANCE);
     if count.checked_mul(stride).is_none_or(|n| n > most) {
         return Err(format!(
-            "declares {count} entries of {stride} bytes, but {} compressed bytes hold at most {most}",
+            "declares {count} entries of {stride} bytes, but {} compressed bytes hold at most \
+             {most}",
             bytes.len()
         ));
     }
@@ -50,7 +51,8 @@ pub(super) fn decode(view: &Compressed, bytes: &[u8]) -> Result<Vec<u8>, String>
         ("INDICES", 4) => decode_index_sequence::<u32>(bytes, count).map(raw),
         (mode, _) => {
             return Err(format!(
-                "is compressed in a way that is not known: mode {:?} with {count} entries of {stride} bytes",
+                "is compressed in a way that is not known: mode {:?} with {count} entries of \
+                 {stride} bytes",
                 mode.chars().take(20).collect::<String>()
             ));
         }
@@ -93,7 +95,8 @@ fn vertices(bytes: &[u8], count: usize, stride: usize) -> meshopt::Result<Vec<u8
     }
     by_words!(
         1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28 29 30 31 32
-        33 34 35 36 37 38 39 40 41 42 43 44 45 46 47 48 49 50 51 52 53 54 55 56 57 58 59 60 61 62 63 64
+        33 34 35 36 37 38 39 40 41 42 43 44 45 46 47 48
+        49 50 51 52 53 54 55 56 57 58 59 60 61 62 63 64
     )
 }
 

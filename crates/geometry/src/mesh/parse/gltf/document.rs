@@ -276,8 +276,8 @@ impl Document {
                 return Err(fault(
                     "the JSON",
                     format_args!(
-                        "has {n_objects} nodes, meshes, primitives, accessors, buffers and views, but at \
-                         most {MAX_OBJECTS} are read"
+                        "has {n_objects} nodes, meshes, primitives, accessors, buffers and views, \
+                         but at most {MAX_OBJECTS} are read"
                     ),
                 ));
             }

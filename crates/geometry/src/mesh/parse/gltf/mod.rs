@@ -124,8 +124,8 @@ impl Scene<'_> {
             return Err(fault(
                 "the scene",
                 format_args!(
-                    "places more than {} vertices and corners, more than a file of its size may: its \
-                     nodes repeat the same mesh",
+                    "places more than {} vertices and corners, more than a file of its size may: \
+                     its nodes repeat the same mesh",
                     self.limit()
                 ),
             ));

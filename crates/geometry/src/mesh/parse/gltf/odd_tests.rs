@@ -23,19 +23,25 @@ fn square() -> ParsedMesh {
 #[test]
 fn parts_that_are_not_needed_may_hold_anything() {
     for more in [
-        r#","animations":[{"channels":[{"sampler":0,"target":{"path":"rotation"}}],"samplers":[]}]"#,
+        r#","animations":[{"channels":[{"sampler":0,"target":{"path":"rotation"}}],
+                "samplers":[]}]"#,
         r#","animations":[{"channels":[{"sampler":0,"target":{"path":"pointer","extensions":
-            {"KHR_animation_pointer":{"pointer":"/materials/0/emissiveFactor"}}}}],"samplers":[{"input":9,"output":9}]}]"#,
-        r#","animations":[{"channels":[],"samplers":[{"interpolation":"NEW"}]}],"skins":[{"joints":[]}]"#,
+            {"KHR_animation_pointer":{"pointer":"/materials/0/emissiveFactor"}}}}],
+                "samplers":[{"input":9,"output":9}]}]"#,
+        r#","animations":[{"channels":[],"samplers":[{"interpolation":"NEW"}]}],
+                "skins":[{"joints":[]}]"#,
         r#","cameras":[{"type":"panoramic"}],"textures":[{"source":99}],"images":[{}]"#,
-        r#","materials":[{"alphaMode":"DITHER","pbrMetallicRoughness":{"baseColorTexture":{"index":77}}}]"#,
-        r#","samplers":[{"magFilter":1}],"extensions":{"NEW_thing":[1,"two",null]},"extensionsUsed":["NEW_thing"]"#,
+        r#","materials":[{"alphaMode":"DITHER",
+                "pbrMetallicRoughness":{"baseColorTexture":{"index":77}}}]"#,
+        r#","samplers":[{"magFilter":1}],"extensions":{"NEW_thing":[1,"two",null]},
+                "extensionsUsed":["NEW_thing"]"#,
         r#","extras":null"#,
         r#","extras":"text""#,
         r#","extras":-1e-3"#,
         r#","extras":[{},[],0]"#,
         r#","extras":{"a":{"b":true}},"unheardOf":18446744073709551616"#,
-        r#","extensionsRequired":["KHR_animation_pointer","KHR_materials_new","KHR_texture_basisu"]"#,
+        r#","extensionsRequired":["KHR_animation_pointer","KHR_materials_new",
+                "KHR_texture_basisu"]"#,
     ] {
         assert_eq!(read(&json(NODE, SQUARE, "", more)), Ok(square()), "{more}");
     }
@@ -104,8 +110,8 @@ fn scenes_may_lack_nodes_and_files_scenes() {
     let both = r#""scene":1,"scenes":[{"nodes":[1]},{"nodes":[1]}]"#;
     assert_eq!(read(&scenes(both)), Ok(square()));
     let message = |text: &str| read(&scenes(text)).unwrap_err().to_string();
-    let elsewhere = "the scene that is read places none of the file's 1 meshes: make the scene that has \
-                     them the default one";
+    let elsewhere = "the scene that is read places none of the file's 1 meshes: make the scene \
+                     that has them the default one";
     assert_eq!(message(r#""scenes":[{},{"nodes":[1]}]"#), elsewhere);
     assert_eq!(
         message(r#""scene":2,"scenes":[{}]"#),
@@ -232,7 +238,8 @@ fn a_file_without_the_buffers_that_it_needs_says_which() {
 
 #[test]
 fn compression_by_draco_is_refused_by_name_unless_there_is_a_way_around_it() {
-    let draco = r#""extensions":{"KHR_draco_mesh_compression":{"bufferView":0,"attributes":{"POSITION":0}}}"#;
+    let draco = r#""extensions":{"KHR_draco_mesh_compression":{"bufferView":0,
+        "attributes":{"POSITION":0}}}"#;
     let whole = SQUARE.replace(r#""indices":1"#, &format!(r#""indices":1,{draco}"#));
     assert_eq!(read(&json(NODE, &whole, "", "")), Ok(square()));
     let hollow = r#",{"componentType":5126,"count":4,"type":"VEC3"}"#;
@@ -244,7 +251,8 @@ fn compression_by_draco_is_refused_by_name_unless_there_is_a_way_around_it() {
     );
     assert_eq!(
         read(&text).unwrap_err().to_string(),
-        "a mesh compressed by KHR_draco_mesh_compression is not read, export it without that extension"
+        "a mesh compressed by KHR_draco_mesh_compression is not read, export it without that \
+         extension"
     );
 }
 
@@ -257,17 +265,20 @@ fn compressed(name: &str, filter: &str, positions: &[u8], indices: &[u8]) -> (St
     let view = |length: usize, begin: usize, n: usize, stride: usize, count: usize, mode: &str| {
         let filter = if mode == "TRIANGLES" { "" } else { filter };
         format!(
-            r#"{{"buffer":1,"byteLength":{length},"extensions":{{"{name}":{{"buffer":0,"byteOffset":{begin},
+            r#"{{"buffer":1,"byteLength":{length},
+                "extensions":{{"{name}":{{"buffer":0,"byteOffset":{begin},
             "byteLength":{n},"byteStride":{stride},"count":{count},"mode":"{mode}"{filter}}}}}}}"#
         )
     };
     let text = format!(
         r#"{{"asset":{{"version":"2.0"}},"extensionsRequired":["{name}"],"scenes":[{{"nodes":[0]}}],
-        "nodes":[{{"mesh":0}}],"meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+        "nodes":[{{"mesh":0}}],
+            "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
         "accessors":[{{"bufferView":0,"componentType":5126,"count":4,"type":"VEC3"}},
         {{"bufferView":1,"componentType":5125,"count":6,"type":"SCALAR"}}],
         "bufferViews":[{},{}],
-        "buffers":[{{"byteLength":{}}},{{"byteLength":72,"extensions":{{"{name}":{{"fallback":true}}}}}}]}}"#,
+        "buffers":[{{"byteLength":{}}},
+                {{"byteLength":72,"extensions":{{"{name}":{{"fallback":true}}}}}}]}}"#,
         view(48, 0, positions.len(), 12, 4, "ATTRIBUTES"),
         view(24, at, indices.len(), 4, 6, "TRIANGLES"),
         binary.len()
