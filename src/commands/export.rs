@@ -9,14 +9,21 @@ use coseg::ipc::client::ClientError;
 use coseg::ipc::convert::{format_from_wire, up_from_wire};
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
+use coseg::library::shown;
 use coseg::mesh::write::{glb, mtl, npy, obj, ply, seg, usda};
 use coseg::mesh::{ParsedMesh, parse};
+use coseg::store::Digest;
 use coseg::text::counted;
 use serde_json::{Value, json};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// The name of the material file in exported OBJ files.
 const MATERIALS: &str = "labels.mtl";
+/// Longest file name that common file systems accept.
+const MAX_FILE_NAME_BYTES: usize = 255;
+/// Hexadecimal digits of the digest in a shortened file name.
+const N_DIGITS: usize = 16;
 
 pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
@@ -51,13 +58,20 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             confidence: false,
         };
         let labels = labels::receive(&mut session, request)?.labels;
-        let (name, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, infos) {
+        let (suffix, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, infos)
+        {
             found
         } else {
             let mesh = original(&mut session, &collection, shape, labels.len())?;
             with_mesh(args.format, shape, (&mesh, up), &labels, infos)
         };
-        write(name, &bytes)?;
+        let stem = file_stem(shape, suffix);
+        if stem != *shape {
+            let name = shown(shape);
+            let note = format!("coseg: {name} is too long for a file name; its file is");
+            progress.suspend(|| eprintln!("{note} {stem}{suffix}"));
+        }
+        write(format!("{stem}{suffix}"), &bytes)?;
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
@@ -79,27 +93,37 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// Name and bytes of a file that contains only labels; `None` for formats that need the mesh.
+/// The part of a shape's file name before `suffix`: the shape's name or, if the file name would be
+/// too long for a file system, its beginning with digits that tell names of one beginning apart.
+fn file_stem<'a>(shape: &'a str, suffix: &str) -> Cow<'a, str> {
+    if shape.len() + suffix.len() <= MAX_FILE_NAME_BYTES {
+        return Cow::Borrowed(shape);
+    }
+    let digits = &Digest::of(shape.as_bytes()).to_string()[..N_DIGITS];
+    let room = MAX_FILE_NAME_BYTES - suffix.len() - 1 - N_DIGITS;
+    let ends = shape.char_indices().map(|(end, _)| end);
+    let end = ends.take_while(|end| *end <= room).last().unwrap_or(0);
+    Cow::Owned(format!("{}~{digits}", &shape[..end]))
+}
+
+/// Suffix and bytes of a file that contains only labels; `None` for formats that need the mesh.
 fn without_mesh(
     format: ExportFormat,
     shape: &str,
     labels: &[i32],
     infos: &[wire::LabelInfo],
-) -> Option<(String, Vec<u8>)> {
+) -> Option<(&'static str, Vec<u8>)> {
     Some(match format {
-        ExportFormat::Labels => (format!("{shape}.labels.txt"), seg(labels).into_bytes()),
-        ExportFormat::Seg => (format!("{shape}.seg"), seg(labels).into_bytes()),
-        ExportFormat::Npy => (format!("{shape}.labels.npy"), npy(labels)),
+        ExportFormat::Labels => (".labels.txt", seg(labels).into_bytes()),
+        ExportFormat::Seg => (".seg", seg(labels).into_bytes()),
+        ExportFormat::Npy => (".labels.npy", npy(labels)),
         ExportFormat::Json => {
             let names: serde_json::Map<String, Value> = materials(infos)
                 .into_iter()
                 .map(|(label, name, _)| (label.to_string(), name.into()))
                 .collect();
             let value = json!({ "shape": shape, "labels": labels, "names": names });
-            (
-                format!("{shape}.labels.json"),
-                value.to_string().into_bytes(),
-            )
+            (".labels.json", value.to_string().into_bytes())
         }
         ExportFormat::Ply | ExportFormat::Obj | ExportFormat::Glb | ExportFormat::Usda => {
             return None;
@@ -118,34 +142,34 @@ fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
     up_from_wire(up).axis()
 }
 
-/// Name and bytes of a file that contains the mesh, with its up axis, and its labels.
+/// Suffix and bytes of a file that contains the mesh, with its up axis, and its labels.
 fn with_mesh(
     format: ExportFormat,
     shape: &str,
     (mesh, up): (&ParsedMesh, Option<[f64; 3]>),
     labels: &[i32],
     infos: &[wire::LabelInfo],
-) -> (String, Vec<u8>) {
+) -> (&'static str, Vec<u8>) {
     let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
     let name = |label| material(label, infos);
     let named = |label| (material(label, infos), colour(label, infos));
     match format {
         ExportFormat::Obj => {
             let text = obj(vertices, &polygons, labels, name, MATERIALS);
-            (format!("{shape}.obj"), text.into_bytes())
+            (".obj", text.into_bytes())
         }
         ExportFormat::Glb => {
             let bytes = glb(shape, vertices, &polygons, labels, up, named);
-            (format!("{shape}.glb"), bytes)
+            (".glb", bytes)
         }
         ExportFormat::Usda => {
             let text = usda(shape, vertices, &polygons, labels, up, named);
-            (format!("{shape}.usda"), text.into_bytes())
+            (".usda", text.into_bytes())
         }
         _ => {
             let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, infos)).collect();
             let bytes = ply(vertices, &polygons, &colours, labels);
-            (format!("{shape}.ply"), bytes)
+            (".ply", bytes)
         }
     }
 }
@@ -184,4 +208,27 @@ pub(super) fn original(
         )));
     }
     Ok(mesh)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MAX_FILE_NAME_BYTES, file_stem};
+
+    #[test]
+    fn long_names_become_distinct_file_names() {
+        let fits = "x".repeat(MAX_FILE_NAME_BYTES - 4);
+        assert_eq!(file_stem(&fits, ".ply"), fits);
+        assert_eq!(file_stem("chair", ".labels.txt"), "chair");
+        for letter in ["x", "\u{e9}", "\u{6905}", "\u{1fa91}"] {
+            let [one, other] = ["1", "2"].map(|end| format!("{}{end}", letter.repeat(254)));
+            let [one, other] = [&one, &other].map(|name| file_stem(name, ".labels.json"));
+            assert_ne!(one, other);
+            assert!(one.starts_with(letter));
+            let room = one.len() + ".labels.json".len();
+            assert!(
+                room <= MAX_FILE_NAME_BYTES && room > MAX_FILE_NAME_BYTES - 4,
+                "{room}"
+            );
+        }
+    }
 }

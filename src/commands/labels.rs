@@ -43,7 +43,7 @@ pub(crate) fn receive(
     })
 }
 
-pub(crate) fn run(args: &Labels, mut session: Session) -> Outcome {
+fn wanted(args: &Labels, session: &mut Session) -> Result<Received, CommandError> {
     let collection = session.collection(&args.within)?;
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
@@ -54,7 +54,12 @@ pub(crate) fn run(args: &Labels, mut session: Session) -> Outcome {
         version: args.version.unwrap_or(0),
         confidence: args.confidence,
     };
-    let received = receive(&mut session, request)?;
+    receive(session, request)
+}
+
+pub(crate) fn run(args: &Labels, mut session: Session) -> Outcome {
+    let received = wanted(args, &mut session);
+    let received = received.map_err(|e| session.explain_shape(e, &args.shape))?;
     if session.json {
         let mut value = json!({
             "shape": args.shape,

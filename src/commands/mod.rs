@@ -84,6 +84,9 @@ pub(crate) enum CommandError {
     /// The arguments are invalid.
     #[error("{0}")]
     Usage(String),
+    /// Several collections are possible, and none was named.
+    #[error("there are several collections, choose one with --collection: {0}")]
+    Ambiguous(String),
     /// The command failed.
     #[error("{0}")]
     Failed(String),
@@ -105,9 +108,10 @@ impl CommandError {
     pub(crate) fn exit_code(&self) -> ExitCode {
         let code = match self {
             Self::Client(ClientError::NoAnswer { .. }) => exit::NO_ANSWER,
-            Self::Client(ClientError::Endpoint(_)) | Self::Usage(_) | Self::Config(_) => {
-                exit::USAGE
-            }
+            Self::Client(ClientError::Endpoint(_))
+            | Self::Usage(_)
+            | Self::Ambiguous(_)
+            | Self::Config(_) => exit::USAGE,
             Self::Serve(ServeError::Start(e)) if e.is_configuration() => exit::USAGE,
             Self::Output(e) if e.kind() == std::io::ErrorKind::BrokenPipe => 0,
             Self::Client(_)

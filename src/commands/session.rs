@@ -3,10 +3,10 @@
 use super::{CommandError, interrupt};
 use crate::cli::{Global, InCollection, OneCollection};
 use coseg::call;
-use coseg::ipc::client::Client;
+use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::endpoint::Endpoint;
 use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
-use coseg::ipc::wire;
+use coseg::ipc::wire::{self, ErrorReason};
 use coseg::library::likely::{did_you_mean, likeliest};
 use coseg::library::shown;
 use coseg::text::counted;
@@ -90,6 +90,26 @@ impl Session {
                 names.push(last);
                 Err(ambiguous(&names))
             }
+        }
+    }
+
+    /// Explains a failure to find `shape` by the collection of that name, if there is one: people
+    /// type a collection where a shape is expected.
+    pub(crate) fn explain_shape(&mut self, error: CommandError, shape: &str) -> CommandError {
+        let is_missing = match &error {
+            CommandError::Client(ClientError::Refused(e)) => e.reason() == ErrorReason::NoShape,
+            CommandError::Ambiguous(_) => true,
+            _ => false,
+        };
+        if !is_missing {
+            return error;
+        }
+        match self.collection_names() {
+            Ok(names) if names.iter().any(|name| name == shape) => CommandError::Usage(format!(
+                "{shape:?} is a collection, but a shape is expected here; `coseg show --collection \
+                 {shape}` shows the collection, `coseg ls {shape}` lists its shapes"
+            )),
+            _ => error,
         }
     }
 
@@ -241,10 +261,7 @@ fn label_named(name: &str, labels: &[wire::LabelInfo]) -> Result<u32, String> {
 /// The error if several collections are possible.
 pub(crate) fn ambiguous(names: &[String]) -> CommandError {
     let names = names.join(", ");
-    let names = shown(&names);
-    CommandError::Usage(format!(
-        "there are several collections, choose one with --collection: {names}"
-    ))
+    CommandError::Ambiguous(shown(&names).into_owned())
 }
 
 /// A progress bar on stderr if stderr is a terminal, else one that draws nothing.

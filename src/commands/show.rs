@@ -3,7 +3,7 @@
 
 use super::collections::warn_of_up;
 use super::session::Session;
-use super::{Outcome, json};
+use super::{CommandError, Outcome, json};
 use crate::cli::Show;
 use coseg::call;
 use coseg::ipc::convert::up_name;
@@ -12,21 +12,32 @@ use coseg::text::counted;
 use coseg::text::table;
 
 pub(crate) fn run(args: &Show, mut session: Session) -> Outcome {
+    match &args.shape {
+        Some(name) => {
+            let found = shape(args, name, &mut session);
+            let (shape, collection) = found.map_err(|e| session.explain_shape(e, name))?;
+            show_shape(&shape, &collection, &session)
+        }
+        None => {
+            let collection = session.collection(&args.within)?;
+            show_collection(&session.describe(&collection)?, &session)
+        }
+    }
+}
+
+fn shape(
+    args: &Show,
+    name: &str,
+    session: &mut Session,
+) -> Result<(wire::Shape, wire::Collection), CommandError> {
     let collection = session.collection(&args.within)?;
     let described = session.describe(&collection)?;
-    match &args.shape {
-        Some(shape) => {
-            let request = wire::GetShapeRequest {
-                collection,
-                shape: shape.clone(),
-            };
-            let shape = call!(session.client, GetShape(request))?
-                .shape
-                .unwrap_or_default();
-            show_shape(&shape, &described, &session)
-        }
-        None => show_collection(&described, &session),
-    }
+    let request = wire::GetShapeRequest {
+        collection,
+        shape: name.to_owned(),
+    };
+    let shape = call!(session.client, GetShape(request))?.shape;
+    Ok((shape.unwrap_or_default(), described))
 }
 
 /// The name of a label, or its id.
