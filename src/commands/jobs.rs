@@ -109,7 +109,7 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
         for item in &failed {
             eprintln!("{}: {}", shown(&item.name), why(item));
         }
-        eprintln!("queued {} again", counted(reply.n_queued, "shape"));
+        eprintln!("queued {} again", counted(reply.n_queued.into(), "shape"));
     }
     if reply.n_queued == 0 && !session.json {
         return Err(CommandError::Failed(format!(

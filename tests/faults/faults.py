@@ -89,8 +89,8 @@ fault(
     "R2", "r2-no-folder-sync", "skip the sync of a folder after the rename",
     "src/store/objects.rs", "lib store::objects::tests::what_was_put_survives_a_crash_at_every_operation",
     (
-        "        match self.disk.sync_dir(folder) {\n            Ok(()) => Ok(()),\n            // Taken back",
-        "        match if FAULT { Ok(()) } else { self.disk.sync_dir(folder) } {\n            Ok(()) => Ok(()),\n            // Taken back",
+        "        match self.disk.sync_dir(folder) {\n            Ok(()) => Ok(()),\n            // The name is taken back",
+        "        match if FAULT { Ok(()) } else { self.disk.sync_dir(folder) } {\n            Ok(()) => Ok(()),\n            // The name is taken back",
     ),
 )
 fault(

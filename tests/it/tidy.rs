@@ -4,6 +4,7 @@
 mod code;
 mod docs;
 mod figures;
+mod words;
 
 use crate::harness::coseg;
 use code::{Flow, code_faults};
@@ -11,6 +12,7 @@ use docs::{commands_in, has_flag, link_faults};
 use figures::{accuracy_faults, demo_faults};
 use std::fs;
 use std::path::{Path, PathBuf};
+use words::{UNCHECKED, word_faults};
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -64,6 +66,29 @@ fn the_code_keeps_to_the_layout() {
     for (file, text) in files(&root().join("tests"), "rs") {
         faults.extend(code_faults(&flow("src"), &file, &text));
     }
+    assert_none(&faults);
+}
+
+#[test]
+fn lines_and_words_are_plain() {
+    let mut checked = Vec::new();
+    for folder in ["benches", "crates", "examples", "src", "tests"] {
+        checked.extend(files(&root().join(folder), "rs"));
+    }
+    checked.extend(files(&root().join("proto"), "proto"));
+    checked.extend(files(&root().join("config"), "toml"));
+    let mut faults = Vec::new();
+    let mut unclean = Vec::new();
+    for (file, text) in &checked {
+        let found = word_faults(file, text);
+        match UNCHECKED.iter().find(|folder| file.starts_with(**folder)) {
+            None => faults.extend(found),
+            Some(folder) if !found.is_empty() => unclean.push(*folder),
+            Some(_) => {}
+        }
+    }
+    let clean = UNCHECKED.iter().filter(|folder| !unclean.contains(folder));
+    faults.extend(clean.map(|folder| format!("{folder} passes; remove it from UNCHECKED")));
     assert_none(&faults);
 }
 

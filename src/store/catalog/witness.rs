@@ -76,7 +76,7 @@ impl Shortfall {
             message: format!(
                 "{}. Nothing was changed. Put back what is missing (catalog.db and catalog.db-wal \
                  belong together), or restore a snapshot; `coseg check --repair` keeps a copy and \
-                 goes on with what is there",
+                 continues with the rest",
                 self.what
             ),
         }

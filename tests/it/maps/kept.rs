@@ -75,7 +75,7 @@ fn spoilt(library: &Library, row: &MapRow, names: (&str, &str)) -> MapRow {
 }
 
 #[test]
-fn a_planted_wrong_map_is_found_and_made_anew() {
+fn a_planted_wrong_map_is_found_and_recomputed() {
     let shapes = family(Family::Animal, 9, 6, &SMALL);
     let (folder, library) = library(4, Up::Unknown);
     stream(&library, &shapes);
