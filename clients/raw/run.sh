@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the example of each language against one daemon, and compares what it prints with `coseg labels`.
+# Runs the example of each language with one daemon, and compares its output with `coseg labels`.
 set -euo pipefail
 cd "$(dirname "$0")"
 source ../setup.sh
@@ -17,7 +17,7 @@ rm -rf "$out"
 mkdir -p "$out"/{cpp,java,typescript}
 "$COSEG_BIN" synth pliers --count 1 --faces 1000 --out "$out/mesh" >/dev/null 2>&1
 mesh=$(echo "$out"/mesh/*.off)
-# A port of the system's choice; the daemon says which.
+# The system chooses the port; the daemon prints it.
 env -u COSEG_ENDPOINT NO_COLOR=1 "$COSEG_BIN" serve --library "$out/library" \
     --endpoint 'tcp://127.0.0.1:*' 2>"$out/log" &
 daemon=$!

@@ -27,7 +27,9 @@ pub(crate) fn run(args: &Stop, mut session: Session) -> Outcome {
         eprintln!("{}", what_is_waited_for(&in_work, reply.n_queued));
     }
     if !args.no_wait {
-        interrupt::say("coseg: interrupted; the daemon finishes its current work, then ends".to_owned());
+        interrupt::say(
+            "coseg: interrupted; the daemon finishes its current work, then ends".to_owned(),
+        );
         wait_until_gone(session.client.endpoint())?;
         interrupt::forget();
     }

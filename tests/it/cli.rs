@@ -424,6 +424,20 @@ fn collections_must_be_named_when_there_are_several() {
         let expected = "coseg: there are several collections, choose one with --collection: a, b\n";
         assert_eq!(stderr(&output), expected);
     }
+    for args in [
+        &["show", "b"][..],
+        &["labels", "b", "-c", "a"],
+        &["nearest", "b"],
+    ] {
+        let output = home.coseg(args);
+        assert_eq!(output.status.code(), Some(2));
+        let text = stderr(&output);
+        assert!(
+            text.starts_with("coseg: \"b\" is a collection, but a shape is expected here; ")
+                && text.contains("`coseg ls b` lists its shapes"),
+            "{text}"
+        );
+    }
     assert_eq!(
         json(&home.coseg(&["show", "-c", "a", "--json"]), 0)["up"],
         "-z"

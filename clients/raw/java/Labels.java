@@ -21,7 +21,7 @@ public class Labels {
 
     public static void main(String[] args) throws Exception {
         socket.setReceiveTimeOut(60_000);
-        socket.connect(args[0]); // tcp://HOST:PORT, for this library has no Unix sockets
+        socket.connect(args[0]); // tcp://HOST:PORT, since this library has no Unix sockets
         var encoded = JobOuterClass.EncodedMesh.newBuilder().setFormat(JobOuterClass.MeshFormat.MESH_FORMAT_OFF);
         encoded.setBytes(Array.BytesRef.newBuilder().setFrame(0));
         var add = JobOuterClass.AddShapesRequest.newBuilder().setCollection("raw");
@@ -35,6 +35,6 @@ public class Labels {
         StringJoiner line = new StringJoiner(" ");
         while (labels.hasRemaining()) line.add("" + labels.get());
         System.out.println(line);
-        System.exit(0); // the context's threads would go on
+        System.exit(0); // the context's threads would keep running
     }
 }

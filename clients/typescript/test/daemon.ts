@@ -1,4 +1,4 @@
-/** The real daemon on a temporary library, and made shapes to feed it. */
+/** Runs the real daemon on a temporary library, and generates shapes for it. */
 
 import { execFileSync, spawn, type ChildProcess } from "node:child_process";
 import { once } from "node:events";
@@ -19,7 +19,7 @@ export class Daemon {
   readonly endpoint = `ipc://${this.folder}/s`;
   #process: ChildProcess | undefined;
 
-  /** `settings` are variables of its environment, `curve` the keys to reach it with. */
+  /** `settings` are variables of its environment, `curve` the keys for connecting to it. */
   constructor(
     readonly settings: Record<string, string> = {},
     readonly curve?: Curve,
@@ -56,7 +56,10 @@ export class Daemon {
   }
 }
 
-/** Paths of made chairs, in the order of their numbers, in a folder that goes with the process. */
+/**
+ * Paths of generated chairs, in the order of their numbers, in a folder that is removed with the
+ * process.
+ */
 export function chairs(count: number): string[] {
   const folder = mkdtempSync(join(tmpdir(), "coseg"));
   process.on("exit", () => rmSync(folder, { recursive: true }));

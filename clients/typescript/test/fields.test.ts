@@ -1,4 +1,7 @@
-/** Every field of every reply has a place in what the client returns: changing it there changes that. */
+/**
+ * Tests that every field of every reply affects a result of the client: changing the field changes
+ * the result.
+ */
 
 import assert from "node:assert/strict";
 import { after, test } from "node:test";
@@ -8,14 +11,14 @@ import { DataType } from "../src/gen/coseg/v1/array_pb.js";
 import { ReplySchema } from "../src/gen/coseg/v1/message_pb.js";
 import { Raw } from "../src/wire.js";
 
-/** Entries of a repeated field: as many as there are states of an item that tell different things. */
+/** Number of entries of a repeated field: one for each state of an item with different contents. */
 const N = 3;
-/** What must have a certain value for the rest to be told, by message, field and entry. */
+/** Fields that must have a certain value for the others to matter, by message, field and entry. */
 const GIVEN = new Map([
   ["JobItem.state", [3, 4, 2]],
   ["Placed.outcome", [1, 2, 3]],
 ]);
-/** Fields without a place, and why. */
+/** Fields without effect, and why. */
 const ELSEWHERE: Record<string, string> = {
   "createCollection.collection": "`create` returns the collection, whose `info` asks for it",
   "addShapes.nShapes": "the caller knows how many it gave",
@@ -24,7 +27,7 @@ const ELSEWHERE: Record<string, string> = {
   "listShapes.nextPageToken": "the client reads page after page",
   "eventsSince.more": "the client reads page after page",
 };
-/** Element types that the protocol names in words. */
+/** Element types that the protocol specifies in comments. */
 const TYPES: Record<string, DataType> = {
   labels: DataType.INT32,
   values: DataType.INT32,
@@ -92,7 +95,7 @@ function frame(seed: number, bytes: number): number {
 function scalar(field: DescField, entry: number, seed: number): unknown {
   if (field.enum !== undefined) {
     const given = GIVEN.get(`${field.parent.name}.${field.name}`);
-    // Not 0, which says nothing.
+    // Not 0, which means unspecified.
     const values = field.enum.values;
     return values[given && seed === 0 ? given[entry]! : 1 + ((entry + seed) % (values.length - 1))]!.number;
   }
@@ -111,7 +114,7 @@ function scalar(field: DescField, entry: number, seed: number): unknown {
   }
 }
 
-/** A message with something in every field, and in the first of those of which only one can be. */
+/** A message with a value in every field, and in the first field of every oneof. */
 function filled(of: DescMessage, entry: number, seed: number, name: string): Message {
   const message = create(of);
   if (of.name === "ArrayRef") {
@@ -133,7 +136,7 @@ function put(message: Message, field: DescField, entry: number, seed: number): v
 
 type Path = { field: DescField; entry: number }[];
 
-/** The reply with the field at a path there, and the same with another value in it. */
+/** The reply with a value in the field at a path, and the same with another value. */
 function pair(of: DescMessage, reply: Message, path: Path): Message[] {
   return [0, 1].map((seed) => {
     const changed = clone(of, reply);
@@ -154,7 +157,7 @@ function pair(of: DescMessage, reply: Message, path: Path): Message[] {
   });
 }
 
-/** The ways to all fields that are no messages themselves, or references to raw frames. */
+/** The paths to all fields that are neither messages nor references to raw frames. */
 function* leaves(of: DescMessage, path: Path = [], entry = 0): Generator<Path> {
   for (const field of of.fields) {
     const kind = field.message;
@@ -165,7 +168,7 @@ function* leaves(of: DescMessage, path: Path = [], entry = 0): Generator<Path> {
   }
 }
 
-/** All that a value of the client says, as text. */
+/** The contents of a value of the client, as text. */
 function told(value: unknown): string {
   const flat = (_: string, v: unknown): unknown => {
     if (typeof v === "bigint") return `${v}n`;

@@ -1,4 +1,4 @@
-/** A client does not talk to whoever made the default folder first. */
+/** Tests that a client does not connect to a default folder that another user created. */
 
 import assert from "node:assert/strict";
 import { chmodSync, chownSync, mkdirSync, mkdtempSync, rmSync, symlinkSync } from "node:fs";

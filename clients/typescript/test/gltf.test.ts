@@ -1,4 +1,4 @@
-/** A `.gltf` with its buffers beside it goes out as one file, or not at all. */
+/** Tests that a `.gltf` with its buffers in separate files is sent as one file, or not at all. */
 
 import assert from "node:assert/strict";
 import { mkdirSync, mkdtempSync, readFileSync, rmSync, symlinkSync, writeFileSync } from "node:fs";
@@ -24,7 +24,7 @@ after(async () => {
   rmSync(folder, { recursive: true });
 });
 
-/** A file whose positions and indices are in others. */
+/** A file whose positions and indices are in separate files. */
 function written(positions = "data/a%20b.bin", indices = "./i.bin"): string {
   const at = join(folder, "mesh");
   mkdirSync(join(at, "data"), { recursive: true });

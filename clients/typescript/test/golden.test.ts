@@ -1,4 +1,4 @@
-/** Recorded conversations: this client says the same bytes, and understands the same. */
+/** Replays recorded conversations: this client sends the same bytes, and reads the same values. */
 
 import assert from "node:assert/strict";
 import { createHash } from "node:crypto";
@@ -78,7 +78,7 @@ before(async () => {
 
 after(() => router.close());
 
-// The client asks again after these, which is tested with the real daemon.
+// The client repeats the request after these, which is tested with the real daemon.
 const again = (entry: Entry) =>
   entry.reply.error?.retry_after_ms !== undefined || entry.reply.error?.reason === "ERROR_REASON_DRAINING";
 
@@ -89,7 +89,7 @@ for (const entry of index.filter((e) => e.request !== undefined && !again(e))) {
     reply = recorded(entry, "reply");
     const lib = new coseg.Library({ endpoint: router.lastEndpoint!, clientId: request.clientId });
     await lib.call("hello", {}, { requestId: "introduction" });
-    // As any call does before its first; here under a known id.
+    // Like any first call, but with a known id.
     lib.hello = async () => ({}) as coseg.Hello;
     const { requestId, deadlineMs } = request;
     const options = { requestId, deadlineMs: Number(deadlineMs), frames };

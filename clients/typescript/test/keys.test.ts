@@ -1,4 +1,4 @@
-/** The daemon's own keys, as `coseg keys generate` makes them, and jobs that failed. */
+/** Tests the keys that `coseg keys generate` writes, and failed jobs. */
 
 import assert from "node:assert/strict";
 import { mkdtempSync, readFileSync, rmSync } from "node:fs";
@@ -51,7 +51,7 @@ test("failed jobs are listed and tried again", async () => {
   for await (const job of lib.jobs({ failed: true })) jobs.push(job);
   assert.equal(jobs.length, 1);
   assert.deepEqual(jobs[0]!.items.map((item) => item.name), ["bad"]);
-  // What is wrong is mended: the same bytes, and workers that pay no heed to the comment.
+  // The cause is removed: the same bytes, and workers that ignore the comment.
   delete settings.COSEG_TEST_POISON;
   await daemon.restart();
   await lib.retry(jobs[0]!.jobId);

@@ -1,4 +1,4 @@
-/** The client against the real daemon. */
+/** Tests the client with the real daemon. */
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";

@@ -1,4 +1,4 @@
-/** Runs what the documents show in blocks marked as TypeScript, each document as one program. */
+/** Runs the TypeScript blocks of the documents, each document as one program. */
 
 import { execFileSync } from "node:child_process";
 import { copyFileSync, mkdirSync, mkdtempSync, readFileSync, rmSync, symlinkSync, writeFileSync } from "node:fs";
@@ -19,7 +19,8 @@ for (const document of ["README.md", "clients/typescript/README.md", "docs/clien
   const daemon = await Daemon.started();
   try {
     mkdirSync(join(folder, "meshes"));
-    // The README's reader has what `coseg synth` made; the others write of shapes called 101 and so on.
+    // The README's reader has the output of `coseg synth`; the other documents name shapes 101 and
+    // so on.
     const name = (path: string, i: number) => (document === "README.md" ? basename(path) : `${101 + i}.off`);
     meshes.forEach((path, i) => copyFileSync(path, join(folder, "meshes", name(path, i))));
     // `coseg` is this package, and types are checked too.
