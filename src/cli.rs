@@ -608,10 +608,10 @@ mod tests {
     fn a_number_of_parts_out_of_range_hears_the_range() {
         for parts in ["-1", "65", "4.5", "many", ""] {
             let line = ["coseg", "add", "x.off", "--parts", parts];
-            let said = Cli::try_parse_from(line).unwrap_err().to_string();
+            let message = Cli::try_parse_from(line).unwrap_err().to_string();
             assert!(
-                said.contains("1 to 64; 0, or no --parts"),
-                "{parts}: {said}"
+                message.contains("1 to 64; 0, or no --parts"),
+                "{parts}: {message}"
             );
         }
         assert!(Cli::try_parse_from(["coseg", "add", "x.off", "--parts", "64"]).is_ok());

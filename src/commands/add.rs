@@ -162,7 +162,7 @@ fn send(
         (reply::Result::AddShapes(reply), _) => jobs.push_back((reply.job_id, n)),
         (other, _) => return Err(unexpected(&other).into()),
     }
-    interrupt::say(left_behind(collection, jobs));
+    interrupt::set_note(left_behind(collection, jobs));
     Ok(())
 }
 
@@ -208,9 +208,9 @@ fn finish_job(
         }
         if job.finished {
             jobs.pop_front();
-            interrupt::forget();
+            interrupt::clear_note();
             if !jobs.is_empty() {
-                interrupt::say(left_behind(&job.collection, jobs));
+                interrupt::set_note(left_behind(&job.collection, jobs));
             }
             return Ok(());
         }

@@ -94,7 +94,8 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
 }
 
 /// The part of a shape's file name before `suffix`: the shape's name or, if the file name would be
-/// too long for a file system, its beginning with digits that tell names of one beginning apart.
+/// too long for a file system, its beginning with digits that distinguish names with the same
+/// beginning.
 fn file_stem<'a>(shape: &'a str, suffix: &str) -> Cow<'a, str> {
     if shape.len() + suffix.len() <= MAX_FILE_NAME_BYTES {
         return Cow::Borrowed(shape);

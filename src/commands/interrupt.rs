@@ -8,7 +8,7 @@ static NOTE: Mutex<Option<String>> = Mutex::new(None);
 static LISTENING: Once = Once::new();
 
 /// Sets the note: from now on an interrupt prints it to stderr, then ends the process as usual.
-pub(super) fn say(note: String) {
+pub(super) fn set_note(note: String) {
     *NOTE.lock().unwrap_or_else(PoisonError::into_inner) = Some(note);
     LISTENING.call_once(|| {
         // Where signals cannot be handled, an interrupt ends the command without the note.
@@ -27,6 +27,6 @@ pub(super) fn say(note: String) {
 }
 
 /// Clears the note, since no work continues in the daemon.
-pub(super) fn forget() {
+pub(super) fn clear_note() {
     *NOTE.lock().unwrap_or_else(PoisonError::into_inner) = None;
 }

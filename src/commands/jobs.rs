@@ -88,7 +88,7 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
     let mut revision = 0;
     if !args.no_wait && !job.finished {
         let id = args.job;
-        interrupt::say(format!(
+        interrupt::set_note(format!(
             "coseg: interrupted; the daemon continues with job {id}\n  to follow: coseg wait -c \
              {:?}\n  to cancel: coseg cancel {id}",
             job.collection
@@ -97,7 +97,7 @@ pub(crate) fn retry(args: &Retry, mut session: Session) -> Outcome {
     while !args.no_wait && !job.finished {
         job = session.watch_job(args.job, &mut revision)?;
     }
-    interrupt::forget();
+    interrupt::clear_note();
     let failed: Vec<_> = job
         .items
         .iter()

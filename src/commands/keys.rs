@@ -47,7 +47,7 @@ pub(crate) fn run(args: &Keys, global: &Global) -> Outcome {
             list.add(client.clone())?;
             pair.write(&path)?;
             list.write(&allow)?;
-            tell(&client, Some(&path), global.json)?;
+            report(&client, Some(&path), global.json)?;
         }
         KeysCommand::Allow { key, name, role } => {
             let key = match key.parse::<PublicKey>() {
@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Keys, global: &Global) -> Outcome {
             let mut list = AllowList::read(&allow)?;
             list.add(client.clone())?;
             list.write(&allow)?;
-            tell(&client, None, global.json)?;
+            report(&client, None, global.json)?;
         }
         KeysCommand::List => list(&allow, global.json)?,
         KeysCommand::Revoke { who } => {
@@ -122,7 +122,7 @@ fn server(dir: &Path, as_json: bool) -> Result<(), CommandError> {
     Ok(())
 }
 
-fn tell(client: &Allowed, file: Option<&Path>, as_json: bool) -> Result<(), CommandError> {
+fn report(client: &Allowed, file: Option<&Path>, as_json: bool) -> Result<(), CommandError> {
     let file = file.map(|f| f.display().to_string());
     if as_json {
         let value = json!({

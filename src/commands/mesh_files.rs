@@ -361,10 +361,10 @@ mod tests {
             "{:?}",
             found.notes
         );
-        let Err(CommandError::Usage(said)) = find(&[path("only")], false) else {
+        let Err(CommandError::Usage(message)) = find(&[path("only")], false) else {
             panic!("a folder without meshes of its own is refused");
         };
-        assert!(said.contains("x/3.off: add --recursive"), "{said}");
+        assert!(message.contains("x/3.off: add --recursive"), "{message}");
         let found = find(&[path("top")], true).unwrap();
         assert_eq!(names(&found), ["a__1", "b__1", "b__deep__2"]);
         assert_eq!(refused(&found).len(), 1);

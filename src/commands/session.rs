@@ -199,11 +199,11 @@ impl Session {
             };
             let reply = call!(self.client, WaitIdle(request))?;
             if reply.idle {
-                interrupt::forget();
+                interrupt::clear_note();
                 return Ok(());
             }
             let bar = bar.get_or_insert_with(|| {
-                interrupt::say(format!(
+                interrupt::set_note(format!(
                     "coseg: interrupted; the daemon continues with the queue of {collection:?}\n  \
                      to follow: coseg wait -c {collection:?}\n  to cancel: coseg cancel -c \
                      {collection:?}"
@@ -303,7 +303,7 @@ mod tests {
             label(5, "", None),
         ];
         assert_eq!(label_named("leg", &labels), Ok(1));
-        for (name, said) in [
+        for (name, expected) in [
             (
                 "back",
                 "2 labels are named \"back\", choose one by its id: 3, 4",
@@ -311,7 +311,7 @@ mod tests {
             ("seta", "no label is named \"seta\"; did you mean \"seat\"?"),
             ("wing", "no label is named \"wing\""),
         ] {
-            assert_eq!(label_named(name, &labels), Err(said.to_owned()));
+            assert_eq!(label_named(name, &labels), Err(expected.to_owned()));
         }
         assert!(label_named("", &labels).is_err());
     }

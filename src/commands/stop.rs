@@ -27,11 +27,11 @@ pub(crate) fn run(args: &Stop, mut session: Session) -> Outcome {
         eprintln!("{}", what_is_waited_for(&in_work, reply.n_queued));
     }
     if !args.no_wait {
-        interrupt::say(
+        interrupt::set_note(
             "coseg: interrupted; the daemon finishes its current work, then ends".to_owned(),
         );
         wait_until_gone(session.client.endpoint())?;
-        interrupt::forget();
+        interrupt::clear_note();
     }
     if session.json {
         let ended = !args.no_wait;

@@ -261,8 +261,8 @@ impl Client {
     /// The address of events: on the host that the client knows, if the daemon listens on all its
     /// addresses.
     fn events(&mut self) -> Result<String, ClientError> {
-        let said = self.hello()?.event_endpoint.clone();
-        match (Endpoint::parse(&said)?, &self.endpoint) {
+        let announced = self.hello()?.event_endpoint.clone();
+        match (Endpoint::parse(&announced)?, &self.endpoint) {
             (Endpoint::Tcp { host, port }, Endpoint::Tcp { host: known, .. })
                 if host == "0.0.0.0" || host == "[::]" =>
             {
@@ -272,7 +272,7 @@ impl Client {
                 }
                 .to_string())
             }
-            _ => Ok(said),
+            _ => Ok(announced),
         }
     }
 

@@ -376,11 +376,11 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&victim).unwrap(), "precious");
         std::fs::remove_file(&lock).unwrap();
         let _lock = claim_socket(&path).unwrap();
-        let said = claim_socket(&path).unwrap_err().to_string();
+        let message = claim_socket(&path).unwrap_err().to_string();
         let pid = std::process::id();
         assert!(
-            said.contains(&format!("running daemon, process {pid}; ")),
-            "{said}"
+            message.contains(&format!("running daemon, process {pid}; ")),
+            "{message}"
         );
     }
 

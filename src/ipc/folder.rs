@@ -172,11 +172,11 @@ mod tests {
         ] {
             fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
             for (folder, fits) in [(&user, for_user), (&service, for_service)] {
-                let said = folder.check().map_err(|e| e.to_string());
-                assert_eq!(said.is_ok(), fits, "{mode:o}: {said:?}");
-                if let Err(said) = said {
+                let message = folder.check().map_err(|e| e.to_string());
+                assert_eq!(message.is_ok(), fits, "{mode:o}: {message:?}");
+                if let Err(message) = message {
                     let what = [format!("has mode {mode:04o}"), "`chmod ".to_owned()];
-                    assert!(what.iter().all(|w| said.contains(w)), "{said}");
+                    assert!(what.iter().all(|w| message.contains(w)), "{message}");
                 }
             }
         }
@@ -203,9 +203,12 @@ mod tests {
             DefaultFolder::User(path.clone()),
             DefaultFolder::Service(path),
         ] {
-            let said = folder.check().unwrap_err().to_string();
-            assert!(said.contains("belongs to user 12345, not to "), "{said}");
-            assert!(said.contains("--endpoint"), "{said}");
+            let message = folder.check().unwrap_err().to_string();
+            assert!(
+                message.contains("belongs to user 12345, not to "),
+                "{message}"
+            );
+            assert!(message.contains("--endpoint"), "{message}");
         }
     }
 }

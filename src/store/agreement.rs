@@ -155,8 +155,8 @@ mod tests {
         ];
         let found = kept.clone().standings_of_new(&new);
         let found: Vec<_> = found.iter().map(|(id, s)| (*id, s.inconsistent)).collect();
-        let told = [(0, false), (1, false), (2, false), (3, true)];
-        assert_eq!(found, told.map(|(at, wrong)| (shapes[at], wrong)));
+        let expected = [(0, false), (1, false), (2, false), (3, true)];
+        assert_eq!(found, expected.map(|(at, wrong)| (shapes[at], wrong)));
         // The same map in place of a stored one.
         let (from, to) = (shapes[1], shapes[0]);
         let standing = |c_12: &[f32]| kept.clone().standing_of(from, to, c_12, 20).unwrap();

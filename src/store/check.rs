@@ -205,7 +205,7 @@ fn check_pages(connection: &Connection, findings: &mut Findings) -> Result<(), S
         let (table, id, parent): (String, Option<i64>, String) =
             (row.get(0)?, row.get(1)?, row.get(2)?);
         let id = id.map_or("?".to_string(), |id| id.to_string());
-        let message = format!("refers to a row of {parent} that is not there");
+        let message = format!("refers to a row of {parent} that does not exist");
         findings.damage(format!("{table} rowid {id}"), message);
     }
     Ok(())
@@ -410,12 +410,11 @@ fn check_maps(
                 };
                 let (one, two) = (name(from), name(to));
                 let text = format!(
-                    "the map from {one} to {two} carries functions otherwise than the maps by way \
-                     of other shapes do: departure {:.2} (0: the same, 1.4: nothing in common), \
-                     the median over {} \
-                     third shapes. Nothing is damaged and nothing need be done: labels that come \
-                     along it count as \
-                     little as its confidence says. `coseg check --repair` looks for a better one",
+                    "the map from {one} to {two} disagrees with the maps by way of other shapes: \
+                     departure {:.2} (0: equal, 1.4: unrelated), the median over {} third shapes. \
+                     Nothing is damaged, and no action is needed: labels transferred by it count \
+                     as little as its confidence says. `coseg check --repair` looks for a better \
+                     map",
                     standing.departure, standing.n_triangles
                 );
                 findings.note(format!("maps {from}, {to}"), text);
@@ -572,7 +571,7 @@ fn check_orphans(
                 continue;
             }
             n_originals += usize::from(folder == ObjectKind::Original.folder());
-            let message = format!("{} bytes that no row names", entry.length);
+            let message = format!("{} bytes without a row", entry.length);
             findings.note(file, message);
         }
     }

@@ -73,7 +73,7 @@ impl LibraryLock {
     }
 
     /// Writes the address of the holder for processes that find the library locked.
-    pub(super) fn tell(&self, endpoint: &str) -> std::io::Result<()> {
+    pub(super) fn write_endpoint(&self, endpoint: &str) -> std::io::Result<()> {
         self.write(endpoint)
     }
 
@@ -167,7 +167,7 @@ mod tests {
                 .to_string()
         };
         assert_eq!(refused(), held(""));
-        lock.tell("ipc:///run/x/coseg.sock").unwrap();
+        lock.write_endpoint("ipc:///run/x/coseg.sock").unwrap();
         assert_eq!(
             refused(),
             held(

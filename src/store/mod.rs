@@ -119,7 +119,7 @@ impl Store {
     pub fn tell_endpoint(&self, endpoint: &str) -> Result<(), StoreError> {
         match &self.lock {
             Some(lock) => lock
-                .tell(endpoint)
+                .write_endpoint(endpoint)
                 .map_err(|e| StoreError::io(&self.dir, e)),
             None => Ok(()),
         }

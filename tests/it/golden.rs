@@ -1,7 +1,6 @@
-//! Recorded conversations are held again with a fresh daemon: what was asked then is answered alike
-//! now.
+//! Replays recorded conversations with a fresh daemon, whose replies must equal the recorded ones.
 //!
-//! The files are made by `tests/golden/record.py`; the clients in other languages replay them too.
+//! `tests/golden/record.py` writes the files; the clients in other languages replay them too.
 
 use crate::harness::Home;
 use coseg::ipc::wire::{Reply, Request, error::Subject, reply};
@@ -27,8 +26,8 @@ fn frames(name: &str, what: &str) -> Vec<Vec<u8>> {
     frames
 }
 
-/// What of a reply does not depend on the processor, the version or the clock: which result it is;
-/// of a refusal all but its words; of shapes their outcomes; of arrays how many there are.
+/// The parts of a reply that do not depend on the processor, the version or the clock: the kind of
+/// result; a refusal without its message; the outcomes of shapes; the number of arrays.
 fn gist(frames: &[Vec<u8>]) -> String {
     let reply = Reply::decode(frames[0].as_slice()).unwrap();
     let name = |result: &reply::Result| {
@@ -118,7 +117,7 @@ fn recorded_conversations_are_answered_alike() {
     assert!(faults.is_empty(), "\n{}", faults.join("\n"));
 }
 
-/// The recorded headers are what this program would send, byte for byte.
+/// The recorded headers equal those that this program sends, byte for byte.
 #[test]
 fn recorded_requests_are_encoded_alike() {
     let text = std::fs::read_to_string(folder().join("index.json")).unwrap();

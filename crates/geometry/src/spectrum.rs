@@ -114,7 +114,7 @@ impl Certificate {
     /// let found = Spectrum::smallest(&sphere.stiffness, &sphere.mass, 10, &Options::default())?;
     /// let certificate = found.certificate;
     /// assert!(certificate.proved() && certificate.perturbation < certificate.margin);
-    /// // At least those that were asked for lie below τ: those of a multiplet come together.
+    /// // At least the requested ones lie below τ; those of a multiplet come together.
     /// assert!(certificate.count >= 10 && found.eigenvalues[9] < certificate.tau);
     /// # Ok::<_, Box<dyn std::error::Error>>(())
     /// ```

@@ -198,7 +198,7 @@ impl Witness {
 
 /// The library and the number of commits that a catalog contains.
 #[derive(Debug, Default, PartialEq, Eq)]
-struct Said {
+struct Contents {
     library: String,
     commits: u64,
 }
@@ -228,7 +228,7 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
         Err(e) => return Err(StoreError::io(catalog, e)),
         Ok(_) => {}
     }
-    if let Ok(alone) = said_by_file_alone(catalog) {
+    if let Ok(alone) = contents_without_log(catalog) {
         let foreign = alone.library != witness.library && !alone.library.is_empty();
         if foreign {
             return lacks(format!(
@@ -248,38 +248,38 @@ pub(in crate::store) fn shortfall(catalog: &Path) -> Result<Option<Shortfall>, S
             }));
         }
     }
-    let Some(said) = said(catalog)? else {
+    let Some(found) = contents(catalog)? else {
         return Ok(None);
     };
-    if said.library != witness.library {
+    if found.library != witness.library {
         return Ok(Some(Shortfall {
             what: "catalog.db-wal is the log of another catalog".into(),
             foreign_log: true,
         }));
     }
-    if said.commits < promised {
+    if found.commits < promised {
         return lacks(format!(
             "catalog.db with its log holds {} changes of {promised} that were acknowledged: the \
              log (catalog.db-wal) is missing, was cut or is an older one",
-            said.commits
+            found.commits
         ));
     }
     Ok(None)
 }
 
 /// The contents of the catalog, including its log; `None` if damage makes it unreadable.
-fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
+fn contents(catalog: &Path) -> Result<Option<Contents>, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let has_log = std::fs::metadata(super::log_of(catalog)).is_ok_and(|log| log.len() > 0);
     // SQLite would create a missing log.
     let read = match has_log {
         true => Connection::open_with_flags(catalog, flags)
             .map_err(StoreError::from)
-            .and_then(|connection| said_by(&connection)),
-        false => said_by_file_alone(catalog),
+            .and_then(|connection| contents_of(&connection)),
+        false => contents_without_log(catalog),
     };
     match read {
-        Ok(said) => Ok(Some(said)),
+        Ok(found) => Ok(Some(found)),
         Err(e) if e.is_damage() => Ok(None),
         // Its tables are not those of a catalog; the check of its format has a better message.
         Err(StoreError::Catalog(e)) if e.sqlite_error_code() == Some(ErrorCode::Unknown) => {
@@ -290,7 +290,7 @@ fn said(catalog: &Path) -> Result<Option<Said>, StoreError> {
 }
 
 /// The contents of the catalog's file without its log; opened as immutable.
-fn said_by_file_alone(catalog: &Path) -> Result<Said, StoreError> {
+fn contents_without_log(catalog: &Path) -> Result<Contents, StoreError> {
     use std::os::unix::ffi::OsStrExt as _;
     let mut uri = String::from("file:");
     for byte in catalog.as_os_str().as_bytes() {
@@ -305,19 +305,19 @@ fn said_by_file_alone(catalog: &Path) -> Result<Said, StoreError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY
         | OpenFlags::SQLITE_OPEN_NO_MUTEX
         | OpenFlags::SQLITE_OPEN_URI;
-    said_by(&Connection::open_with_flags(uri, flags)?)
+    contents_of(&Connection::open_with_flags(uri, flags)?)
 }
 
-fn said_by(connection: &Connection) -> Result<Said, StoreError> {
+fn contents_of(connection: &Connection) -> Result<Contents, StoreError> {
     connection.busy_timeout(super::BUSY_TIMEOUT)?;
     schema::register_row_sum(connection)?;
     let n_tables: i64 =
         connection.query_row("SELECT count(*) FROM sqlite_schema", [], |row| row.get(0))?;
     if n_tables == 0 {
-        return Ok(Said::default());
+        return Ok(Contents::default());
     }
     let reader = Reader::new(connection);
-    Ok(Said {
+    Ok(Contents {
         library: reader.meta(LIBRARY_ID)?.unwrap_or_default(),
         commits: reader.n_commits()?,
     })

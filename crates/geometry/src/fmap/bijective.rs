@@ -129,8 +129,8 @@ impl Pair {
     ) -> (Vec<u32>, Vec<u32>) {
         let k = self.k;
         let (phi1, phi2) = (one.leading(k), two.leading(k));
-        let carried1 = product_transposed(&phi1, &self.c_12, one.n, k, k);
-        let carried2 = product_transposed(&phi2, &self.c_21, two.n, k, k);
+        let transferred1 = product_transposed(&phi1, &self.c_12, one.n, k, k);
+        let transferred2 = product_transposed(&phi2, &self.c_21, two.n, k, k);
         let dim = hints.dim;
         let join = |a: &[f32], b: &[f32], x: &[f32]| {
             let mut rows = Vec::with_capacity(a.len() + b.len() + x.len());
@@ -141,8 +141,8 @@ impl Pair {
             }
             rows
         };
-        let queries = join(&phi2, &carried2, &hints.two);
-        let targets = join(&carried1, &phi1, &hints.one);
+        let queries = join(&phi2, &transferred2, &hints.two);
+        let targets = join(&transferred1, &phi1, &hints.one);
         nearest_both(&queries, &targets, 2 * k + dim)
     }
 

@@ -97,7 +97,7 @@ impl Orientation {
 
     /// On `other`, the crossed functions of the eigenfunctions of this shape below `k`, transferred
     /// by `c_12` `(rows, columns)`: `(pairs, other.q)`.
-    fn carried_then_crossed(
+    fn transferred_then_crossed(
         &self,
         other: &Self,
         c_12: &[f32],
@@ -141,14 +141,14 @@ impl Orientation {
         let rows = c_12.len() / columns.max(1);
         let (q1, q2) = (self.q.min(columns), other.q.min(rows));
         let (from, _) = self.crossed(columns);
-        let back = self.carried_then_crossed(other, c_12, columns, columns);
+        let back = self.transferred_then_crossed(other, c_12, columns, columns);
         let (mut dot, mut left, mut right) = (0.0f64, 0.0f64, 0.0f64);
         for (from, back) in from.chunks_exact(self.q).zip(back.chunks_exact(other.q)) {
             for (r, &back) in back[..q2].iter().enumerate() {
                 let row = &c_12[r * columns..r * columns + q1];
-                let carried: f32 = row.iter().zip(from).map(|(c, f)| c * f).sum();
-                dot += f64::from(carried * back);
-                left += f64::from(carried * carried);
+                let transferred: f32 = row.iter().zip(from).map(|(c, f)| c * f).sum();
+                dot += f64::from(transferred * back);
+                left += f64::from(transferred * transferred);
                 right += f64::from(back * back);
             }
         }
@@ -168,7 +168,7 @@ impl Orientation {
         two: (&[f32], usize),
     ) -> (Vec<f32>, Vec<f32>, usize) {
         let (from, q1) = self.crossed(k);
-        let back = self.carried_then_crossed(other, c_12, k, k);
+        let back = self.transferred_then_crossed(other, c_12, k, k);
         let dim = from.len() / q1.max(1);
         let evaluate = |crossed: &[f32], q: usize, (rows, stride): (&[f32], usize)| {
             let n = rows.len() / stride;

@@ -133,7 +133,7 @@ pub fn descriptor_zoomout(
 ///
 /// let sphere = SpectralMesh::new(icosphere(2), Operator::Tufted, 16, &Options::default())?;
 /// let (basis, faces) = (sphere.basis(), &sphere.mesh.faces);
-/// // A descriptor that tells nothing: the map is grown from the start alone, a point reflection.
+/// // A constant descriptor: the map is grown from the start alone, a point reflection.
 /// let shape = MapShape {
 ///     eigenvalues: basis.eigenvalues,
 ///     eigenvectors: basis.eigenvectors,
@@ -228,7 +228,7 @@ fn refined(
         Some((c_12, columns)) => {
             let rows = c_12.len() / columns.max(1);
             let beta = weight(rows);
-            let carried = product(
+            let transferred = product(
                 &basis_2.rows(&queries, rows),
                 c_12,
                 queries.len(),
@@ -237,7 +237,7 @@ fn refined(
             );
             let known = basis_1.rows(&targets, columns);
             nearest_rows(
-                &embedding(&carried, columns, &q2, beta),
+                &embedding(&transferred, columns, &q2, beta),
                 &embedding(&known, columns, &t1, beta),
                 columns + dim,
             )
@@ -258,19 +258,19 @@ fn refined(
     for &k in before_last {
         let (k1, k2) = sizes(one, two, k, most);
         let (c_12, beta) = (fitted(&matched, k1, k2), weight(k));
-        let carried = product(&sampled.leading(k2), &c_12, queries.len(), k2, k1);
+        let transferred = product(&sampled.leading(k2), &c_12, queries.len(), k2, k1);
         let known = basis_1.rows(&targets, k1);
         matched = nearest_rows(
-            &embedding(&carried, k1, &q2, beta),
+            &embedding(&transferred, k1, &q2, beta),
             &embedding(&known, k1, &t1, beta),
             k1 + dim,
         );
     }
     let (k1, k2) = sizes(one, two, largest, most);
     let (c_12, beta) = (fitted(&matched, k1, k2), weight(largest));
-    let carried = product(&basis_2.leading(k2), &c_12, two.mass.len(), k2, k1);
+    let transferred = product(&basis_2.leading(k2), &c_12, two.mass.len(), k2, k1);
     let (p2p_21, p2p_12) = nearest_both(
-        &embedding(&carried, k1, &x2, beta),
+        &embedding(&transferred, k1, &x2, beta),
         &embedding(&basis_1.leading(k1), k1, &x1, beta),
         k1 + dim,
     );

@@ -106,11 +106,11 @@ impl Assessment {
         let weighted = returns.iter().zip(&one.1.mass);
         let sum: f64 = weighted.map(|(d, m)| f64::from(d * m)).sum();
         let total: f64 = one.1.mass.iter().map(|m| f64::from(*m)).sum();
-        let carried = |v: u32| one.0[dense_21[v as usize] as usize];
+        let transferred = |v: u32| one.0[dense_21[v as usize] as usize];
         let own = dirichlet(two.1, two.0, |v| two.0[v as usize]);
         Self {
             round_trip: sum / total.max(1e-300),
-            smoothness: dirichlet(two.1, two.0, carried) / own.max(1e-300),
+            smoothness: dirichlet(two.1, two.0, transferred) / own.max(1e-300),
         }
     }
 }

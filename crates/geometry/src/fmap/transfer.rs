@@ -27,21 +27,21 @@ pub fn pulled_back<T: Copy>(p2p_21: &[u32], values: &[T], dim: usize) -> Vec<T> 
 /// lacks detail that the basis does not represent.
 ///
 /// ```
-/// use coseg_geometry::fmap::transfer::carried;
+/// use coseg_geometry::fmap::transfer::transferred;
 /// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
 ///
 /// let sphere = SpectralMesh::new(icosphere(3), Operator::Tufted, 4, &Options::default())?;
 /// let height: Vec<f32> = sphere.mesh.vertices.iter().map(|p| p[2] as f32).collect();
 /// // The point reflection turns height over.
 /// let c = [1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0, 0., 0., 0., 0., -1.0];
-/// let found = carried(&sphere.basis(), &sphere.basis(), &c, 4, &height, 1);
+/// let found = transferred(&sphere.basis(), &sphere.basis(), &c, 4, &height, 1);
 /// assert!(found.iter().zip(&height).all(|(x, z)| (x + z).abs() < 0.01));
 /// # Ok::<_, coseg_geometry::SpectralMeshError>(())
 /// ```
 ///
 /// # Panics
 /// If there are fewer than `k1` or `k2` eigenvectors.
-pub fn carried(
+pub fn transferred(
     one: &Basis<'_>,
     two: &Basis<'_>,
     c_12: &[f32],
@@ -158,16 +158,16 @@ pub fn labels_to_faces(
 mod tests {
     use super::super::convert::functional;
     use super::super::test_shapes::cycle;
-    use super::{carried, faces_to_faces, labels_to_faces, pulled_back};
+    use super::{faces_to_faces, labels_to_faces, pulled_back, transferred};
 
     #[test]
-    fn both_ways_carry_a_smooth_function() {
+    fn both_ways_transfer_a_smooth_function() {
         let (a, b) = (cycle(120, 0), cycle(120, 40));
         let p2p: Vec<u32> = (0..120).map(|v| (v + 40) % 120).collect();
         let c = functional(&a.basis(), &b.basis(), &p2p, 11, 11);
         let f: Vec<f32> = (0..120).map(|v| a.eigenvectors[v * 11 + 3] - 2.0).collect();
         let sharp = pulled_back(&p2p, &f, 1);
-        let smooth = carried(&a.basis(), &b.basis(), &c, 11, &f, 1);
+        let smooth = transferred(&a.basis(), &b.basis(), &c, 11, &f, 1);
         for v in 0..120 {
             assert_eq!(sharp[v], f[(v + 40) % 120]);
             assert!((smooth[v] - sharp[v]).abs() < 1e-3);
@@ -185,15 +185,15 @@ mod tests {
             [2, 2, 7, 7]
         );
         let ones = [1.0, 1.0, 1.0, 1.0];
-        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &[true; 6], &ones, 1);
-        assert!(carried.iter().all(|x| (x - 1.0).abs() < 1e-6));
+        let transferred = faces_to_faces(&faces, &faces, 6, &p2p, &[true; 6], &ones, 1);
+        assert!(transferred.iter().all(|x| (x - 1.0).abs() < 1e-6));
         // One end of the strip has no counterpart.
         let matched = [false, false, true, true, true, true];
         assert_eq!(
             labels_to_faces(&faces, &faces, 6, &p2p, &matched, &labels),
             [-1, 2, 7, 7]
         );
-        let carried = faces_to_faces(&faces, &faces, 6, &p2p, &matched, &ones, 1);
-        assert!(carried[0].is_nan() && carried[1..].iter().all(|x| (x - 1.0).abs() < 1e-6));
+        let transferred = faces_to_faces(&faces, &faces, 6, &p2p, &matched, &ones, 1);
+        assert!(transferred[0].is_nan() && transferred[1..].iter().all(|x| (x - 1.0).abs() < 1e-6));
     }
 }
