@@ -301,7 +301,7 @@ fn top_follows_the_daemon() {
     );
     let text = stdout(&home.coseg(&["top", "-n", "1"]), 0);
     assert!(
-        text.contains("2 shapes in 1 collections") && !text.contains('\x1b'),
+        text.contains("2 shapes in 1 collection,") && !text.contains('\x1b'),
         "{text}"
     );
 }

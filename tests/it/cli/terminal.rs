@@ -71,7 +71,7 @@ fn what_cannot_be_undone_is_asked_at_a_terminal_and_nowhere_else() {
     let output = home.coseg(&["collections", "delete", "c"]);
     assert_eq!(stdout(&output, 0), "");
     assert!(
-        stderr(&output).starts_with("c: deleted, with 1 shapes and "),
+        stderr(&output).starts_with("c: deleted, with 1 shape and "),
         "{}",
         stderr(&output)
     );
@@ -107,7 +107,7 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
     assert_eq!(output.status.signal(), Some(Signal::INT.as_raw()));
     let said = stderr(&output);
     assert!(
-        said.contains("the daemon goes on with what it accepted"),
+        said.contains("the daemon continues with the accepted work"),
         "{said}"
     );
     assert!(said.contains("to follow: coseg wait -c \"c\""), "{said}");
@@ -129,7 +129,7 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
         .as_u64()
         .unwrap();
     assert!((1..80).contains(&n), "{n} shapes");
-    // The rest of the collection is deleted.
+    // The command cancels all unfinished jobs of the collection; none is left.
     let nothing = home.coseg(&["cancel", "-c", "c"]);
     assert_eq!(stdout(&nothing, 0), "");
     assert!(

@@ -273,7 +273,7 @@ fn a_client_id_belongs_to_the_key_that_uses_it() {
     };
     let first = job(&mut boss, "a", "first");
     assert_eq!(job(&mut boss, "a", "first"), first);
-    // The same request under another key is a different request, and so is a third key's.
+    // The same request id under another key names another request.
     let second = job(&mut feeder, "a", "first");
     assert_ne!(second, first);
     assert_eq!(job(&mut feeder, "a", "first"), second);

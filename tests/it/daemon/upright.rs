@@ -111,7 +111,7 @@ fn an_axis_that_is_missing_or_unknown_is_refused() {
     );
 }
 
-/// The more requests are answered in between, the more moments of the kill are tested.
+/// The number of requests that are answered before the kill varies its moment.
 #[test]
 fn kill_9_while_the_axis_changes_leaves_the_old_or_the_new_one() {
     for n_answers in [0, 3, 30] {
