@@ -69,7 +69,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         if stem != *shape {
             let name = shown(shape);
             let note = format!("coseg: {name} is too long for a file name; its file is");
-            progress.suspend(|| eprintln!("{note} {stem}{suffix}"));
+            progress.suspend(|| eprintln!("{note} {}{suffix}", shown(&stem)));
         }
         write(format!("{stem}{suffix}"), &bytes)?;
         progress.inc(1);

@@ -138,7 +138,7 @@ mod tests {
         ] {
             assert_eq!(message(text.as_bytes()), wanted);
         }
-        assert!(message(b"{\"labels\": [").starts_with("it is no JSON: "));
+        assert!(message(b"{\"labels\": [").starts_with("it is not JSON: "));
         assert_eq!(
             message(&npy(&[0, -2])),
             "the label of face 1 is -2, but must be -1 to 65535"
