@@ -466,7 +466,7 @@ mod tests {
         for (text, message) in [
             ("admin\n", "line 1: 1 words, expected 3"),
             ("\n# x\nroot a b\n", "line 3: role is \"root\""),
-            ("admin short b\n", "is no key"),
+            ("admin short b\n", "is not a key"),
         ] {
             let error = AllowList::parse(text, Path::new("allow")).unwrap_err();
             assert!(error.to_string().contains(message), "{error}");
