@@ -85,7 +85,7 @@ macro_rules! kind {
     };
 }
 
-/// Defines all kinds. A row's name is that of the request's field in `request.proto`.
+/// Defines all kinds. A row's name is that of the request's field in `message.proto`.
 macro_rules! operations {
     (
         anywhere { $(
