@@ -17,8 +17,8 @@ use tokio::sync::mpsc;
 const BATCH: usize = 256;
 /// Time between heartbeats.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Deleted collections that heartbeats still name, so that a subscriber that missed the deletion notices. The
-/// oldest is dropped beyond: clients may create and delete collections without end.
+/// Deleted collections that heartbeats still name, so that a subscriber that missed the deletion
+/// notices. The oldest is dropped beyond: clients may create and delete collections without end.
 const MAX_DELETED: usize = 256;
 
 /// The last published event of each collection.
