@@ -1,30 +1,31 @@
-//! Who may connect and what each may ask: the ZAP handler and the roles.
+//! Decides which clients may connect and what each may request: the ZAP handler and the roles.
 //!
-//! Without keys the socket's directory, or the loopback interface, decides who gets here. With keys every
-//! connection is CURVE, and the allow list is asked twice: when a connection is made (ZAP, ZeroMQ RFC 27),
-//! and again for each request, so that a key that is revoked is refused at once.
+//! Without keys, the socket's directory or the loopback interface decides who can connect. With
+//! keys, every connection is CURVE, and the allow list is checked twice: when a connection is made
+//! (ZAP, ZeroMQ RFC 27), and for each request, so that a revoked key is refused at once.
 
+use crate::daemon::answer::not_allowed;
 use crate::ipc::convert;
 use crate::ipc::keys::{
     ALLOW_FILE, AllowList, KeyError, KeyPair, PublicKey, Role, SERVER_KEY_FILE,
 };
-use crate::ipc::wire::{self, ErrorCode, ErrorReason, request::Body};
+use crate::ipc::wire::{self, ErrorCode, ErrorReason};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio::sync::watch;
 
-/// Where ZeroMQ asks about connections.
+/// The endpoint for ZeroMQ's questions about connections.
 pub(crate) const ZAP_ENDPOINT: &str = "inproc://zeromq.zap.01";
 
 /// Inode, length and time of change of the allow list; none where it is missing.
 type Stamp = Option<(u64, u64, i64, i64)>;
 
-/// Who may do what.
+/// How clients are authorized.
 pub(crate) enum Access {
-    /// Whoever can connect, with this role.
+    /// Every client that can connect has this role.
     Open(Role),
-    /// Whoever is on the list.
+    /// The keys on the allow list have the roles that it gives them.
     Keys(Keys),
 }
 
@@ -32,16 +33,16 @@ pub(crate) enum Access {
 pub(crate) struct Keys {
     server: KeyPair,
     path: PathBuf,
-    /// Of the list as it was last read.
+    /// The stamp of the list as it was last read. Locked while the list is read again.
     stamp: Mutex<Stamp>,
     list: watch::Sender<Arc<AllowList>>,
 }
 
 impl Access {
-    /// As the folder of keys says; open without one.
+    /// Reads the folder of keys; without one, access is open.
     pub(crate) fn new(keys: &Path) -> Result<Self, KeyError> {
         if keys.as_os_str().is_empty() {
-            // Over TCP, draining is refused all the same: anybody on the machine can connect.
+            // Over TCP, draining is refused nevertheless: every user of the machine can connect.
             return Ok(Self::Open(Role::Admin));
         }
         let path = keys.join(ALLOW_FILE);
@@ -54,8 +55,8 @@ impl Access {
         }))
     }
 
-    /// Reads the allow list again if its file has changed, or if `always`. True if somebody was taken off it
-    /// or may do less.
+    /// Reads the allow list again if its file has changed, or if `always`. Returns true if a key
+    /// was taken off it.
     pub(crate) fn reload(&self, always: bool) -> bool {
         let Self::Keys(keys) = self else { return false };
         let found = stamp(&keys.path);
@@ -81,14 +82,14 @@ impl Access {
                 gone
             }
             Err(e) => {
-                // Told once for each change of the file.
+                // Logged once for each change of the file.
                 tracing::error!(error = %e, "the allow list stays as it was");
                 false
             }
         }
     }
 
-    /// Makes a socket that is to be bound take only connections that are allowed.
+    /// Lets a socket that is to be bound accept authenticated connections only.
     pub(crate) fn protect(&self, socket: &zmq::Socket) -> Result<(), zmq::Error> {
         match self {
             Self::Open(_) => Ok(()),
@@ -119,9 +120,9 @@ impl Access {
         }
     }
 
-    /// Refuses a request that its sender may not make. `user` is the key, as ZeroMQ vouches for it.
-    pub(crate) fn check(&self, user: Option<&str>, body: Option<&Body>) -> Result<(), wire::Error> {
-        let needed = body.map_or(Role::ReadOnly, needed);
+    /// Refuses a request for which the client's role does not suffice. `user` is the key that
+    /// ZeroMQ has authenticated.
+    pub(crate) fn check(&self, user: Option<&str>, needed: Role) -> Result<(), wire::Error> {
         let (role, name) = match self {
             Self::Open(role) => (*role, String::new()),
             Self::Keys(keys) => {
@@ -143,7 +144,7 @@ impl Access {
         ))
     }
 
-    /// The list as it stands, for those who wait to see that they are taken off it.
+    /// The current list, for requests in flight that must notice when their key is taken off it.
     pub(crate) fn allowed(&self) -> Option<watch::Receiver<Arc<AllowList>>> {
         match self {
             Self::Open(_) => None,
@@ -160,56 +161,6 @@ impl Access {
 impl Keys {
     fn list(&self) -> Arc<AllowList> {
         Arc::clone(&self.list.borrow())
-    }
-}
-
-/// Who asks is not on the list; `rest` tells what becomes of the request.
-pub(crate) fn not_allowed(rest: &str) -> wire::Error {
-    let text = format!("the client's key is not, or no longer, on the allow list{rest}");
-    convert::error(
-        ErrorCode::PermissionDenied,
-        ErrorReason::KeyNotAllowed,
-        text,
-    )
-}
-
-/// The least role that may make a request.
-fn needed(body: &Body) -> Role {
-    match body {
-        Body::Hello(_)
-        | Body::Stats(_)
-        | Body::ListCollections(_)
-        | Body::DescribeCollection(_)
-        | Body::GetJob(_)
-        | Body::ListJobs(_)
-        | Body::WatchJob(_)
-        | Body::WaitIdle(_)
-        | Body::ListShapes(_)
-        | Body::GetShape(_)
-        | Body::GetLabels(_)
-        | Body::GetOriginal(_)
-        | Body::LabelsSnapshot(_)
-        | Body::GetSpectrum(_)
-        | Body::GetHks(_)
-        | Body::GetDescriptors(_)
-        | Body::GetFunctionalMap(_)
-        | Body::GetPartCorrespondence(_)
-        | Body::Nearest(_)
-        | Body::GetPortraits(_)
-        | Body::TransferFunction(_)
-        | Body::SuggestNext(_)
-        | Body::EventsSince(_) => Role::ReadOnly,
-        Body::CreateCollection(_)
-        | Body::NameLabel(_)
-        | Body::UpdateCollection(_)
-        | Body::CorrectLabels(_)
-        | Body::MergeLabels(_)
-        | Body::SplitLabel(_)
-        | Body::Undo(_)
-        | Body::AddShapes(_)
-        | Body::CancelJob(_)
-        | Body::RemoveShape(_) => Role::Ingest,
-        Body::DeleteCollection(_) | Body::RetryJob(_) | Body::Drain(_) => Role::Admin,
     }
 }
 

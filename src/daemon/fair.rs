@@ -1,17 +1,17 @@
-//! Turns for work that only so many may do at a time, handed out so that clients take turns.
+//! Limits how many requests do some work at a time, and lets clients take turns at it.
 //!
-//! Within a client, first come, first served; between clients, round robin: whoever sends a thousand
-//! requests delays its own, not those of others.
+//! The requests of one client are served in order, and clients are served round robin: a client
+//! that sends a thousand requests delays its own, not those of others.
 
 use bytes::Bytes;
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::oneshot;
 
-/// Who has a turn: the key of an authenticated client, else its connection.
+/// A client for the purpose of turns: the key if it is authenticated, else its connection.
 pub(crate) type Client = Bytes;
 
-/// A number of places, and those who wait for one.
+/// A number of places, and the requests that wait for one.
 pub(crate) struct Gate {
     state: Mutex<State>,
 }

@@ -1,15 +1,18 @@
-//! Files that a request names by path: opened once, below a directory that the configuration allows, and read from what
-//! was opened, whatever the name stands for by then.
+//! Reads files that a request names by path. Each is opened once, below a directory that the
+//! configuration allows, and everything after that uses the open file, whatever the name stands for
+//! by then.
 //!
-//! Whoever may write into such a directory can swap a file for a link to another one, or for a pipe, at any moment. So links
-//! are followed first, to learn where the path leads; what is opened is that place, from the allowed directory
-//! down, where no step may be a link any more (`openat2`, or step by step where the kernel has none). It is looked at after
-//! it was opened: a regular file, not too large. No more is read than it had then.
+//! A user who may write into such a directory can replace a file by a link to another one, or by a
+//! pipe, at any moment. So links are resolved first, to learn where the path leads. That place is
+//! then opened from the allowed directory down, and no step may be a link (`openat2`, or step by
+//! step where the kernel has none). The open file must be regular and not too large, and no more
+//! than its length at that time is read.
 //!
-//! A network file system may hang in any of this. It is done in threads that are left behind when time is up.
+//! A network file system may hang in any of this, so it is done in threads that are abandoned when
+//! the time is up.
 
-use crate::daemon::Daemon;
-use crate::daemon::requests::busy;
+use crate::daemon::answer::busy;
+use crate::daemon::shared::Daemon;
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason};
 use rustix::fs::{CWD, Mode, OFlags, ResolveFlags, openat, openat2};
@@ -22,16 +25,14 @@ use std::path::{Component, Path, PathBuf};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
-/// Threads that may be reading files, or hang in it, at a time.
-pub(crate) const MAX_THREADS: usize = 128;
 /// How long one file may take, unless the request's own deadline is sooner.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// How long after that deadline the file is given up: the answer is that the deadline passed.
 const AFTER_DEADLINE: Duration = Duration::from_millis(500);
-/// Between attempts to open a file that somebody has leased and was asked to give back.
+/// Between attempts to open a file whose lease its holder was asked to give back.
 const LEASE_PACE: Duration = Duration::from_millis(20);
 
-/// Opened without following links, and without waiting for the other end of a pipe.
+/// Opens without following links, and without waiting for the other end of a pipe.
 const OPEN: OFlags = OFlags::RDONLY
     .union(OFlags::NOFOLLOW)
     .union(OFlags::NONBLOCK)
@@ -77,28 +78,28 @@ impl<'a> Files<'a> {
         })
     }
 
-    /// All of a file, which must have `length` bytes as when it was asked about.
+    /// All bytes of a file, which must still have `length` of them.
     pub(crate) fn read(&self, path: &Path, length: u64) -> Result<Vec<u8>, wire::Error> {
-        let Some(memory) = self.daemon.request_memory.try_reserve(length) else {
+        let Some(memory) = self.daemon.admission.memory.try_reserve(length) else {
             return Err(busy("no memory is left for the files that requests name"));
         };
         let (name, roots) = (path.to_owned(), self.roots.clone());
         let length = length.min(self.max_bytes);
         self.by_deadline(path, move |until| {
-            // Also while this hangs and nobody waits for it.
+            // Held also while this hangs and nobody waits for it.
             let _memory = memory;
             let file = open(&name, &roots, until)?;
             read_all(file, length).map_err(|e| unreadable(&name, &e))
         })
     }
 
-    /// What `work` returns, which is told when it must be done; an error if that passes.
+    /// Runs `work`, which gets the time by which it must be done; an error if that passes.
     fn by_deadline<T: Send + 'static>(
         &self,
         path: &Path,
         work: impl FnOnce(Instant) -> Result<T, Refusal> + Send + 'static,
     ) -> Result<T, wire::Error> {
-        let Ok(permit) = Arc::clone(&self.daemon.reading).try_acquire_owned() else {
+        let Ok(permit) = Arc::clone(&self.daemon.capacity.reading).try_acquire_owned() else {
             return Err(busy("too many files are being read"));
         };
         let patience = Instant::now() + PATIENCE;
@@ -127,7 +128,8 @@ impl<'a> Files<'a> {
             )),
             Ok(Err(Refusal::Unreadable(text))) => Err(refuse(text)),
             Err(_) => Err(refuse(format!(
-                "{path} could not be read in time: the disk or network file system that it is on hangs"
+                "{path} could not be read in time: the disk or network file system that it is on \
+                 hangs"
             ))),
         }
     }
@@ -142,7 +144,7 @@ fn open(path: &Path, roots: &[PathBuf], until: Instant) -> Result<File, Refusal>
     let (root, below) = resolve(path, roots).ok_or(Refusal::Forbidden)?;
     loop {
         match open_beneath(&root, &below) {
-            // Whoever has a lease on it was told by this attempt to give it back.
+            // This attempt asked the holder of a lease to give it back.
             Err(Errno::AGAIN) if Instant::now() < until => std::thread::sleep(LEASE_PACE),
             Err(Errno::LOOP | Errno::XDEV | Errno::NOTDIR | Errno::NOENT) => {
                 return Err(unreadable(path, &"it was exchanged while it was opened"));
@@ -162,20 +164,20 @@ fn open(path: &Path, roots: &[PathBuf], until: Instant) -> Result<File, Refusal>
     }
 }
 
-/// Where a path leads, links followed: one of `roots`, and the way from there.
+/// The target of a path after its links: one of `roots`, and the path from there.
 fn resolve(path: &Path, roots: &[PathBuf]) -> Option<(PathBuf, PathBuf)> {
     if !path.is_absolute() {
         return None;
     }
-    let place = path.canonicalize().ok()?;
+    let location = path.canonicalize().ok()?;
     roots.iter().find_map(|root| {
         let root = root.canonicalize().ok()?;
-        let below = place.strip_prefix(&root).ok()?.to_owned();
+        let below = location.strip_prefix(&root).ok()?.to_owned();
         Some((root, below))
     })
 }
 
-/// Opens what is at `below` from `root` down, where no step is a link.
+/// Opens `below` from `root` down; no step may be a link.
 fn open_beneath(root: &Path, below: &Path) -> Result<File, Errno> {
     if below.as_os_str().is_empty() {
         return Ok(openat(CWD, root, OPEN, Mode::empty())?.into());
@@ -234,7 +236,8 @@ mod tests {
     use std::path::{Path, PathBuf};
     use std::time::Instant;
 
-    /// An allowed folder with a file, a link to it, a link to one outside, a folder, a link to a folder outside, a pipe.
+    /// An allowed folder with a file, a link to it, a link to one outside, a folder, a link to a
+    /// folder outside, and a pipe.
     fn folders() -> (tempfile::TempDir, PathBuf) {
         let dir = tempfile::tempdir().unwrap();
         let (root, outside) = (dir.path().join("in"), dir.path().join("out"));
@@ -276,7 +279,7 @@ mod tests {
         }
     }
 
-    /// As if the name had been exchanged after it was looked at.
+    /// As if the name had been replaced after its links were resolved.
     #[test]
     fn what_is_exchanged_for_a_link_or_a_pipe_is_not_opened() {
         let (_dir, root) = folders();

@@ -1,13 +1,12 @@
-//! Shapes are taken in: room in the queue is reserved, files are written side by side, and what is there is accepted in the
-//! order of arrival, together where several wait.
+//! Accepts shapes: reserves room in the queue, writes files in parallel, and accepts the shapes in
+//! the order of their arrival, several requests in one transaction if they wait.
 
+use crate::daemon::answer::{panicked, refused};
 use crate::daemon::fair::{Client, Gate, Pass, Turn};
 use crate::daemon::ingest::Files;
 use crate::daemon::progress::Load;
-use crate::daemon::publish::Notice;
-use crate::daemon::requests::panic_error;
-use crate::daemon::writes::{Done, may_change, refuse};
-use crate::daemon::{Daemon, blocking};
+use crate::daemon::shared::{Daemon, Notice, blocking};
+use crate::daemon::writes::{Done, may_change};
 use crate::ipc::convert::{self, Source};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::size::in_words;
@@ -21,12 +20,12 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 
-/// Milliseconds, at least and at most, after which a queue of shapes that is full is worth another try.
+/// Milliseconds, at least and at most, after which a client should try a full queue again.
 const QUEUE_RETRY_MS: (u64, u64) = (250, 60_000);
 /// Additions that are accepted in one transaction at most.
 const MAX_TOGETHER: usize = 64;
 
-/// Room in the queue for shapes that are being taken in, given back when dropped.
+/// Room in the queue for shapes that are being added, given back when dropped.
 pub(crate) struct Room {
     daemon: Arc<Daemon>,
     n_bytes: Vec<u64>,
@@ -39,8 +38,8 @@ impl Room {
             daemon: Arc::clone(daemon),
             n_bytes: Vec::new(),
         };
-        // Where nothing is taken in, that is the reason to tell; what can never be taken in is looked at
-        // closely, and told what is wrong with it.
+        // A drain is the better reason to report, and shapes that the queue can never hold are
+        // refused later, with the exact limit.
         match room.resize(vec![0; n_shapes]) {
             Err(full) if full.code() == ErrorCode::ResourceExhausted && !daemon.is_draining() => {
                 Err(full)
@@ -49,8 +48,9 @@ impl Room {
         }
     }
 
-    /// Reserves room for shapes of so many bytes in place of what is reserved, which is kept if there is none: by number, by
-    /// bytes, and by the time that placing all of them is estimated to take.
+    /// Reserves room for shapes of so many bytes in place of the present reservation, which stays
+    /// if there is no room. The queue is bounded by number, by bytes, and by the estimated time
+    /// until all of it is placed.
     fn resize(&mut self, n_bytes: Vec<u64>) -> Result<(), wire::Error> {
         let mut progress = self.daemon.work.progress();
         progress.release(&self.n_bytes);
@@ -77,9 +77,9 @@ pub(crate) struct Addition {
     room: Room,
 }
 
-/// Writes the files of shapes, durably. Whether there is such a collection shows when it is their turn: a request before
-/// theirs may create it.
-pub(crate) fn keep(
+/// Writes the files of shapes, durably. Whether the collection exists is checked in their turn,
+/// since an earlier request may create it.
+pub(crate) fn store_originals(
     daemon: &Arc<Daemon>,
     request: wire::AddShapesRequest,
     frames: &[Bytes],
@@ -106,10 +106,10 @@ pub(crate) fn keep(
     }
     room.resize(n_bytes.clone())?;
     for input in &inputs {
-        check_shape_name(&input.name).map_err(refuse)?;
+        check_shape_name(&input.name).map_err(refused)?;
     }
     let mut shapes = KeptShapes::new();
-    // One after the other, so that one file at a time is in memory.
+    // One after the other, so that only one file is in memory.
     for (input, length) in inputs.into_iter().zip(n_bytes) {
         let bytes = match input.source {
             Source::Bytes(bytes) => bytes,
@@ -122,7 +122,7 @@ pub(crate) fn keep(
             replace: input.replace,
         };
         let library = &daemon.library;
-        library.keep_another(&mut shapes, shape).map_err(refuse)?;
+        library.keep_another(&mut shapes, shape).map_err(refused)?;
     }
     Ok(Addition {
         request,
@@ -132,23 +132,24 @@ pub(crate) fn keep(
     })
 }
 
-/// What came of an addition.
+/// The result of an addition.
 type Accepted = Result<Done, wire::Error>;
 
 enum Step {
     Accept(Box<Addition>, oneshot::Sender<Accepted>),
-    /// Tells when all before it are done.
+    /// Report when all before it are done.
     Settle(oneshot::Sender<()>),
 }
 
-/// Where additions, and changes that keep their order among them, take turns.
+/// The order of additions, and of changes that settle among them.
 pub(crate) struct Intake {
     gate: Arc<Gate>,
     steps: mpsc::UnboundedSender<Step>,
 }
 
 impl Intake {
-    /// Accepts additions from now on, for as long as this is there. Those who wait are bounded by the requests in hand.
+    /// Accepts additions from now on, for as long as this exists. The requests in flight bound how
+    /// many wait.
     pub(crate) fn new(daemon: &Arc<Daemon>) -> Arc<Self> {
         let (steps, queue) = mpsc::unbounded_channel();
         tokio::spawn(accept_in_order(Arc::clone(daemon), queue));
@@ -161,7 +162,7 @@ impl Intake {
         self.gate.queue(client)
     }
 
-    /// Hands over an addition whose turn has come.
+    /// Accepts an addition whose turn has come.
     pub(crate) fn accept(&self, addition: Addition) -> oneshot::Receiver<Accepted> {
         let (sender, accepted) = oneshot::channel();
         self.step(Step::Accept(Box::new(addition), sender));
@@ -188,9 +189,9 @@ impl Intake {
     }
 }
 
-const ACCEPTS: &str = "invariant: additions are accepted while an intake is there";
+const ACCEPTS: &str = "invariant: additions are accepted while an intake exists";
 
-/// Accepts what has come while the last transaction was under way, in one transaction.
+/// Accepts the additions that came during the previous transaction, in one transaction.
 async fn accept_in_order(daemon: Arc<Daemon>, mut queue: mpsc::UnboundedReceiver<Step>) {
     let mut steps = Vec::new();
     while queue.recv_many(&mut steps, MAX_TOGETHER).await > 0 {
@@ -201,7 +202,7 @@ async fn accept_in_order(daemon: Arc<Daemon>, mut queue: mpsc::UnboundedReceiver
                     additions.push(addition);
                     waiting.push(sender);
                 }
-                // Whoever waits holds the turn: nothing comes after it.
+                // Its request holds the turn: nothing comes after it.
                 Step::Settle(sender) => settled.push(sender),
             }
         }
@@ -209,11 +210,11 @@ async fn accept_in_order(daemon: Arc<Daemon>, mut queue: mpsc::UnboundedReceiver
             let n = additions.len();
             let accepted = blocking(&daemon, move |d| accept_together(d, &additions)).await;
             let accepted = accepted.unwrap_or_else(|panic| {
-                let refused = || Err(panic_error(&panic));
+                let refused = || Err(panicked(&panic));
                 std::iter::repeat_with(refused).take(n).collect()
             });
             for (sender, accepted) in waiting.into_iter().zip(accepted) {
-                // Whoever asked may have stopped waiting.
+                // The request may have stopped waiting.
                 let _ = sender.send(accepted);
             }
         }
@@ -223,7 +224,8 @@ async fn accept_in_order(daemon: Arc<Daemon>, mut queue: mpsc::UnboundedReceiver
     }
 }
 
-/// Accepts shapes whose files are there, durably. What a request creates is there for those after it.
+/// Accepts shapes whose files are durable. A collection that a request creates exists for those
+/// after it.
 fn accept_together(daemon: &Arc<Daemon>, additions: &[Box<Addition>]) -> Vec<Accepted> {
     let creates = |a: &Addition| {
         a.request.create.is_some() && daemon.library.collection(&a.request.collection).is_err()
@@ -241,7 +243,7 @@ fn accept_together(daemon: &Arc<Daemon>, additions: &[Box<Addition>]) -> Vec<Acc
         accepted.extend(some.iter().zip(checked).map(|(addition, checked)| {
             checked?;
             let job = jobs.next().expect("invariant: a job for each submission");
-            Ok(addition.take_up(daemon, &job.map_err(refuse)?))
+            Ok(addition.begin(daemon, &job.map_err(refused)?))
         }));
     }
     accepted
@@ -278,9 +280,9 @@ impl Addition {
         }
     }
 
-    /// Begins the work on what was accepted.
-    fn take_up(&self, daemon: &Arc<Daemon>, job: &Job) -> Done {
-        daemon.take_up(job, &self.room.n_bytes);
+    /// Begins the work on the accepted shapes.
+    fn begin(&self, daemon: &Arc<Daemon>, job: &Job) -> Done {
+        daemon.begin(job, &self.room.n_bytes);
         match self.request.mode() {
             wire::AddMode::Wait => Done::WhenPlaced(job.id),
             wire::AddMode::Job | wire::AddMode::Unspecified => {
@@ -315,7 +317,7 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
             load.n_bytes as f64,
             max_bytes,
         ),
-        // An estimate alone refuses nothing for good: an empty queue takes whatever it says.
+        // An estimate alone never refuses for good: an empty queue accepts every request.
         (
             "limits.max_queued_seconds",
             |n| format!("{n} seconds of work"),
@@ -324,25 +326,30 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
             max_secs,
         ),
     ];
-    for (key, words, asked, queued, limit) in bounds {
-        if asked > limit {
-            let (asked, limit) = (words(asked), words(limit));
-            let text = format!("the request has {asked}, the whole queue holds {limit} ({key})");
+    for (key, words, requested, queued, limit) in bounds {
+        if requested > limit {
+            let (requested, limit) = (words(requested), words(limit));
+            let text =
+                format!("the request has {requested}, the whole queue holds {limit} ({key})");
             let code = ErrorCode::InvalidArgument;
             return Err(convert::error(code, ErrorReason::MessageTooLarge, text));
         }
-        if queued + asked > limit {
-            let [queued_in_words, asked_in_words, limit_in_words] =
-                [queued, asked, limit].map(words);
+        if queued + requested > limit {
+            let [queued_in_words, requested_in_words, limit_in_words] =
+                [queued, requested, limit].map(words);
             let text = format!(
-                "{queued_in_words} are queued and {asked_in_words} more asked for, the limit is \
-                 {limit_in_words} ({key})"
+                "{queued_in_words} are queued and {requested_in_words} more asked for, the limit \
+                 is {limit_in_words} ({key})"
             );
             let code = ErrorCode::ResourceExhausted;
             let mut error = convert::error(code, ErrorReason::QueueFull, text);
-            // Until as much is done as there is too much of.
-            let wait = load.seconds() * (queued + asked - limit) / queued.max(1.0);
-            let n_refused = daemon.counters.refused.fetch_add(1, Ordering::Relaxed);
+            // Until the excess is done.
+            let wait = load.seconds() * (queued + requested - limit) / queued.max(1.0);
+            let n_refused = daemon
+                .telemetry
+                .counters
+                .refused
+                .fetch_add(1, Ordering::Relaxed);
             error.retry_after_ms = spread_out(wait * 1e3, n_refused);
             return Err(error);
         }
@@ -350,8 +357,8 @@ fn admit(daemon: &Daemon, load: &Load, n_bytes: &[u64]) -> Result<(), wire::Erro
     Ok(())
 }
 
-/// Milliseconds to be told to the `n`th who is refused: up to twice as many, evenly, so that those who were refused at the
-/// same moment do not come back at the same moment.
+/// The delay in milliseconds for the `n`th refused request: up to twice `wait_ms`, spread evenly,
+/// so that requests that were refused together do not come back together.
 fn spread_out(wait_ms: f64, n: u64) -> u64 {
     // The fraction of n times the golden ratio.
     let share = n.wrapping_mul(0x9E37_79B9_7F4A_7C15) as f64 / 2.0_f64.powi(64);
@@ -363,10 +370,13 @@ fn spread_out(wait_ms: f64, n: u64) -> u64 {
 fn ensure_collection(
     daemon: &Arc<Daemon>,
     name: &str,
-    wish: &wire::CollectionSpec,
+    wanted: &wire::CollectionSpec,
 ) -> Result<(), wire::Error> {
-    if !wish.name.is_empty() && wish.name != name {
-        let text = format!("create.name is {:?}, but collection is {name:?}", wish.name);
+    if !wanted.name.is_empty() && wanted.name != name {
+        let text = format!(
+            "create.name is {:?}, but collection is {name:?}",
+            wanted.name
+        );
         return Err(convert::field_error(
             ErrorReason::FieldRange,
             "create.name",
@@ -375,14 +385,14 @@ fn ensure_collection(
     }
     let named = wire::CollectionSpec {
         name: name.to_owned(),
-        ..wish.clone()
+        ..wanted.clone()
     };
     let spec = convert::collection_spec(&named, "create")?;
     match daemon.library.collection(name) {
         Ok(is) => match convert::collection_differs(&named, &is.spec) {
             None => Ok(()),
-            Some((setting, wish, is)) => {
-                let text = format!("collection {name:?} has {setting} {is}, not {wish}");
+            Some((setting, wanted, is)) => {
+                let text = format!("collection {name:?} has {setting} {is}, not {wanted}");
                 let code = ErrorCode::FailedPrecondition;
                 Err(convert::error(code, ErrorReason::CollectionDiffers, text))
             }
@@ -391,11 +401,11 @@ fn ensure_collection(
             let info = daemon
                 .library
                 .create_collection(&spec, None)
-                .map_err(refuse)?;
+                .map_err(refused)?;
             daemon.notice(Notice::Created(name.to_owned(), info.sequence));
             Ok(())
         }
-        Err(e) => Err(refuse(e)),
+        Err(e) => Err(refused(e)),
     }
 }
 
@@ -404,13 +414,16 @@ mod tests {
     use super::{QUEUE_RETRY_MS, spread_out};
 
     #[test]
-    fn those_who_are_refused_together_come_back_one_after_the_other() {
-        let mut told: Vec<u64> = (0..64).map(|n| spread_out(0.0, n)).collect();
-        told.sort_unstable();
-        assert!(told[0] >= QUEUE_RETRY_MS.0 && told[63] < 2 * QUEUE_RETRY_MS.0);
-        let gaps = told.windows(2).map(|w| w[1] - w[0]);
-        assert!(gaps.clone().max() <= Some(8), "{told:?}");
-        assert!(gaps.clone().filter(|gap| *gap == 0).count() < 4, "{told:?}");
+    fn requests_that_are_refused_together_come_back_one_after_the_other() {
+        let mut delays: Vec<u64> = (0..64).map(|n| spread_out(0.0, n)).collect();
+        delays.sort_unstable();
+        assert!(delays[0] >= QUEUE_RETRY_MS.0 && delays[63] < 2 * QUEUE_RETRY_MS.0);
+        let gaps = delays.windows(2).map(|w| w[1] - w[0]);
+        assert!(gaps.clone().max() <= Some(8), "{delays:?}");
+        assert!(
+            gaps.clone().filter(|gap| *gap == 0).count() < 4,
+            "{delays:?}"
+        );
         assert_eq!(spread_out(f64::INFINITY, 1), QUEUE_RETRY_MS.1);
     }
 }

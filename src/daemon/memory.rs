@@ -1,4 +1,4 @@
-//! A number of bytes that work in hand may take, handed out in reservations.
+//! A budget of bytes, handed out in reservations.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
@@ -47,11 +47,11 @@ impl Budget {
         })
     }
 
-    /// Waits until there is room. More than the limit is handed out when nothing else is, so that a limit
-    /// that was lowered cannot block for ever.
+    /// Waits until there is room. If nothing else is reserved, more than the limit is handed out,
+    /// so that a lowered limit cannot block for ever.
     pub(crate) async fn reserve(self: &Arc<Self>, bytes: u64) -> Reservation {
         loop {
-            // Made before looking: what is freed from here on is not missed.
+            // Made before the check, so that no release after it is missed.
             let freed = self.freed.notified();
             let limit = self.state().limit;
             if let Some(reservation) = self.try_reserve(bytes.min(limit)) {
@@ -76,7 +76,7 @@ impl Budget {
 }
 
 impl Reservation {
-    /// Takes so many bytes more, or leaves it as it is.
+    /// Reserves so many bytes more, or leaves the reservation as it is.
     #[must_use]
     pub(crate) fn try_grow(&mut self, bytes: u64) -> bool {
         let Some(mut more) = self.budget.try_reserve(bytes) else {

@@ -1,4 +1,4 @@
-//! What the daemon does becomes numbers: for Prometheus at `/metrics`, and for `coseg stats` and `coseg top`.
+//! Counts what the daemon does, for Prometheus at `/metrics` and for `coseg stats` and `coseg top`.
 //!
 //! `docs/metrics.md` lists them.
 
@@ -14,7 +14,8 @@ use prometheus_client::registry::{Registry, Unit};
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// Upper bounds of the histogram of stages, in seconds: most take milliseconds, a spectrum of a large mesh seconds.
+/// Upper bounds of the histogram of stages, in seconds: most take milliseconds, a spectrum of a
+/// large mesh seconds.
 const STAGE_BOUNDS: [f64; 12] = [
     0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.5, 1.0, 3.0, 10.0, 60.0, 600.0,
 ];
@@ -53,21 +54,21 @@ struct Page {
     status: u16,
 }
 
-/// What is read when somebody asks, not counted.
+/// Values that are read for each scrape, not counted.
 #[derive(Debug, Default)]
 pub(crate) struct Now {
     pub(crate) library: LibraryStats,
     pub(crate) n_queued: usize,
-    /// Jobs of which a shape is in work, and jobs that only wait.
+    /// Jobs with a shape in work, and jobs that only wait.
     pub(crate) n_jobs: (usize, usize),
     pub(crate) at_stages: BTreeMap<String, usize>,
     pub(crate) memory_limit: u64,
-    /// Bytes that are reserved, and what for.
+    /// Reserved bytes, by purpose.
     pub(crate) memory_reserved: [(&'static str, u64); 4],
     pub(crate) resident_bytes: u64,
     pub(crate) workers: usize,
     pub(crate) uptime_secs: f64,
-    pub(crate) requests_in_hand: usize,
+    pub(crate) requests_in_flight: usize,
     pub(crate) ready: bool,
 }
 
@@ -105,50 +106,14 @@ struct Gauges {
     reserved: Labelled<State, Gauge>,
     resident: Gauge,
     workers: Gauge,
-    in_hand: Gauge,
+    in_flight: Gauge,
     ready: Gauge,
     uptime: Gauge<f64, std::sync::atomic::AtomicU64>,
 }
 
-fn gauge(n: u64) -> i64 {
-    i64::try_from(n).unwrap_or(i64::MAX)
-}
-
-impl Metrics {
-    pub(crate) fn new() -> Self {
-        let metrics = Self {
-            registry: Registry::default(),
-            stage_seconds: Family::new_with_constructor(|| Histogram::new(STAGE_BOUNDS)),
-            finished: Family::default(),
-            relabelled: Counter::default(),
-            inconsistent: Counter::default(),
-            workers_died: Counter::default(),
-            events: Counter::default(),
-            replies: Counter::default(),
-            received_bytes: Counter::default(),
-            sent_bytes: Counter::default(),
-            refusals: Family::default(),
-            faults: Family::default(),
-            pages: Family::default(),
-            gauges: Gauges::default(),
-            stages: Mutex::default(),
-        };
-        // Those that alerts are written for are there from the start, at 0.
-        for outcome in ["added", "replaced", "unchanged", "failed", "cancelled"] {
-            let _ = metrics.finished.get_or_create(&OutcomeLabel { outcome });
-        }
-        for task in ["place", "relabel", "publish", "sweep"] {
-            let _ = metrics.faults.get_or_create(&Task { task });
-        }
-        metrics.registered()
-    }
-
-    fn registered(mut self) -> Self {
-        let all = &mut self.registry;
-        let r = all.sub_registry_with_prefix("coseg");
-        let version = vec![("version", env!("CARGO_PKG_VERSION"))];
-        r.register("build", "The program", Info::new(version));
-        let g = &self.gauges;
+impl Gauges {
+    fn register(&self, r: &mut Registry) {
+        let g = self;
         r.register("ready", "1 if changes are accepted", g.ready.clone());
         r.register_with_unit("uptime", "Since the start", Unit::Seconds, g.uptime.clone());
         r.register("collections", "Collections", g.collections.clone());
@@ -173,8 +138,12 @@ impl Metrics {
         r.register(
             "requests_in_hand",
             "Requests being answered or waiting for it",
-            g.in_hand.clone(),
+            g.in_flight.clone(),
         );
+    }
+
+    fn register_bytes(&self, r: &mut Registry) {
+        let g = self;
         let bytes = || Unit::Bytes;
         r.register_with_unit(
             "stored",
@@ -201,6 +170,55 @@ impl Metrics {
             bytes(),
             g.resident.clone(),
         );
+    }
+}
+
+fn gauge(n: u64) -> i64 {
+    i64::try_from(n).unwrap_or(i64::MAX)
+}
+
+impl Metrics {
+    pub(crate) fn new() -> Self {
+        let metrics = Self {
+            registry: Registry::default(),
+            stage_seconds: Family::new_with_constructor(|| Histogram::new(STAGE_BOUNDS)),
+            finished: Family::default(),
+            relabelled: Counter::default(),
+            inconsistent: Counter::default(),
+            workers_died: Counter::default(),
+            events: Counter::default(),
+            replies: Counter::default(),
+            received_bytes: Counter::default(),
+            sent_bytes: Counter::default(),
+            refusals: Family::default(),
+            faults: Family::default(),
+            pages: Family::default(),
+            gauges: Gauges::default(),
+            stages: Mutex::default(),
+        };
+        // Series that alerts use exist from the start, at 0.
+        for outcome in ["added", "replaced", "unchanged", "failed", "cancelled"] {
+            let _ = metrics.finished.get_or_create(&OutcomeLabel { outcome });
+        }
+        for task in ["place", "relabel", "publish", "sweep"] {
+            let _ = metrics.faults.get_or_create(&Task { task });
+        }
+        metrics.registered()
+    }
+
+    fn registered(mut self) -> Self {
+        let mut all = std::mem::take(&mut self.registry);
+        let r = all.sub_registry_with_prefix("coseg");
+        let version = vec![("version", env!("CARGO_PKG_VERSION"))];
+        r.register("build", "The program", Info::new(version));
+        self.gauges.register(r);
+        self.gauges.register_bytes(r);
+        self.register_counters(r);
+        self.registry = all;
+        self
+    }
+
+    fn register_counters(&self, r: &mut Registry) {
         r.register_with_unit(
             "stage_duration",
             "Time that shapes took in each stage",
@@ -241,13 +259,13 @@ impl Metrics {
         r.register_with_unit(
             "received",
             "Requests over ZeroMQ",
-            bytes(),
+            Unit::Bytes,
             self.received_bytes.clone(),
         );
         r.register_with_unit(
             "sent",
             "Replies over ZeroMQ",
-            bytes(),
+            Unit::Bytes,
             self.sent_bytes.clone(),
         );
         r.register(
@@ -260,7 +278,6 @@ impl Metrics {
             "Answers over HTTP, by path and status",
             self.pages.clone(),
         );
-        self
     }
 
     /// A shape was added, replaced, or found to be there.
@@ -319,7 +336,7 @@ impl Metrics {
         self.pages.get_or_create(&Page { path, status }).inc();
     }
 
-    /// What became of each stage, for the wire.
+    /// The statistics of each stage, for the wire.
     pub(crate) fn stages(&self, now: &BTreeMap<String, usize>) -> Vec<wire::StageStats> {
         let stages = self.stages.lock().unwrap_or_else(PoisonError::into_inner);
         let n_now = |stage: &str| now.get(stage).map_or(0, |&n| n as u32);
@@ -369,7 +386,7 @@ impl Metrics {
         }
         g.resident.set(gauge(now.resident_bytes));
         g.workers.set(gauge(now.workers as u64));
-        g.in_hand.set(gauge(now.requests_in_hand as u64));
+        g.in_flight.set(gauge(now.requests_in_flight as u64));
         g.ready.set(i64::from(now.ready));
         g.uptime.set(now.uptime_secs);
         let mut out = String::new();
@@ -386,7 +403,7 @@ mod tests {
     use crate::library::{Outcome, Placed};
 
     #[test]
-    fn what_is_counted_is_told() {
+    fn counts_are_reported() {
         let metrics = Metrics::new();
         let placed = Placed {
             outcome: Outcome::Added,

@@ -1,23 +1,16 @@
-//! What the other threads leave for the socket thread to send, and what it tells of clients that do not read.
+//! Messages that the other threads leave for the socket thread to send, and its count of the
+//! connections that it ended.
 
+use crate::daemon::answer::{Peer, busy};
 use crate::daemon::replies::{Frame, Replies};
-use crate::daemon::requests;
 use crate::ipc::wire::{Reply, reply};
 use bytes::Bytes;
 use prost::Message as _;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 
-/// Between two lines of the log that say that connections were dropped.
-const SAY_DROPPED: Duration = Duration::from_secs(10);
-
-/// Where a reply goes.
-#[derive(Debug, Clone)]
-pub(crate) struct Peer {
-    pub(crate) identity: Bytes,
-    /// Whether the peer puts an empty frame before the header, as a REQ socket does.
-    pub(crate) delimiter: bool,
-}
+/// Between two lines of the log that report ended connections.
+const REPORT_PACE: Duration = Duration::from_secs(10);
 
 pub(crate) enum Outgoing {
     Reply {
@@ -34,7 +27,7 @@ pub(crate) enum Outgoing {
     Stop,
 }
 
-/// Where the other threads leave what is to be sent.
+/// The queue of messages to be sent.
 pub(crate) struct Outbox {
     queue: mpsc::Sender<Outgoing>,
     wake: Mutex<zmq::Socket>,
@@ -42,7 +35,7 @@ pub(crate) struct Outbox {
 }
 
 impl Outbox {
-    /// With where the socket thread finds what is left here.
+    /// The outbox, and the end of its queue for the socket thread.
     pub(crate) fn new(
         wake: zmq::Socket,
         replies: Arc<Replies>,
@@ -56,13 +49,13 @@ impl Outbox {
         (Arc::new(outbox), queue)
     }
 
-    /// Sends a reply; or, where there is no room for it, says so.
+    /// Sends a reply or, if there is no room for it, an error that says so.
     pub(crate) fn reply(&self, peer: Peer, mut reply: Reply, mut frames: Vec<Bytes>) {
         frames.insert(0, reply.encode_to_vec().into());
         let taken = self.replies.take(&peer.identity, frames).or_else(|_| {
             self.replies.end_stalled(|client| self.end(client));
             let text = "replies that are not read yet leave no memory for this one";
-            reply.result = Some(reply::Result::Error(requests::busy(text)));
+            reply.result = Some(reply::Result::Error(busy(text)));
             self.replies
                 .take(&peer.identity, vec![reply.encode_to_vec().into()])
         });
@@ -92,7 +85,7 @@ impl Outbox {
     }
 
     fn push(&self, outgoing: Outgoing) {
-        // The thread is gone: so is whoever waits for this.
+        // The thread is gone, and with it the receivers of this.
         if self.queue.send(outgoing).is_err() {
             return;
         }
@@ -105,7 +98,7 @@ impl Outbox {
     }
 }
 
-/// Connections that were ended since the start, and what of that was said.
+/// Connections that were ended since the start, and the last report of them.
 #[derive(Default)]
 pub(crate) struct Dropped {
     /// Their clients did not read.
@@ -114,27 +107,27 @@ pub(crate) struct Dropped {
     pub(crate) excess: u64,
     /// They subscribed to more than they may.
     pub(crate) subscriptions: u64,
-    said: Option<(Instant, u64)>,
+    reported: Option<(Instant, u64)>,
 }
 
 impl Dropped {
-    /// Says it if there is something new, and not too often.
-    pub(crate) fn say(&mut self) {
+    /// Logs the counts if they have changed, and not too often.
+    pub(crate) fn report(&mut self) {
         let all = self.unread + self.excess + self.subscriptions;
-        let recently = |at: Instant| at.elapsed() < SAY_DROPPED;
+        let recently = |at: Instant| at.elapsed() < REPORT_PACE;
         if self
-            .said
+            .reported
             .map_or(all == 0, |(at, n)| n == all || recently(at))
         {
             return;
         }
-        self.said = Some((Instant::now(), all));
+        self.reported = Some((Instant::now(), all));
         tracing::warn!(
             unread = self.unread,
             excess = self.excess,
             subscriptions = self.subscriptions,
-            "connections were ended, since the start: of clients that do not read their replies, that send more \
-             than limits.memory has room for, or that subscribe to too much"
+            "connections were ended, since the start: of clients that do not read their replies, \
+             that send more than limits.memory has room for, or that subscribe to too much"
         );
     }
 }

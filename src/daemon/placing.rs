@@ -1,16 +1,15 @@
-//! A lane places the described shapes of one collection, strictly in order of acceptance. With nothing to place it labels
-//! stale shapes anew.
+//! Places the described shapes of one collection, strictly in order of acceptance. When there is
+//! nothing to place, stale shapes are relabelled.
 //!
-//! The work is done in workers, as describing is; what ends a worker is counted with what ended others over the same
-//! shape. A worker commits by itself, so what became of a shape is what the catalog says.
+//! Workers do the work, as they do for describing, and attempts that end a worker are counted
+//! together with those of describing. A worker commits by itself, so the catalog decides what
+//! became of a shape.
 
-use crate::daemon::publish::Notice;
-use crate::daemon::work::{
-    MAX_ATTEMPTS, Outcome, Prepared, Step, cancelled, died_each_time, failed, note_death, prepare,
-    too_long,
-};
-use crate::daemon::worker::{self, Ended, Placing, panicked};
-use crate::daemon::{Daemon, blocking};
+use crate::daemon::describing::{MAX_ATTEMPTS, note_death, prepare};
+use crate::daemon::failures::{cancelled, died_each_time, failed, panicked, too_long};
+use crate::daemon::shared::{Daemon, Notice, blocking};
+use crate::daemon::work::{Outcome, Prepared, Step};
+use crate::daemon::worker::{self, Ended, Placing};
 use crate::ipc::convert;
 use crate::library::{Described, Failure, ItemState, JobItem, LibraryError};
 use crate::store::StoreError;
@@ -19,13 +18,13 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 
-/// Delay before a failed write is tried again, doubled each time.
+/// Delay before a failed write is tried again, doubled each time up to the last.
 const FIRST_RETRY: Duration = Duration::from_secs(1);
 const LAST_RETRY: Duration = Duration::from_secs(30);
-/// Refusals of the library to place what was cancelled meanwhile.
+/// The reason with which the library refuses a shape that was cancelled meanwhile.
 const CANCELLED: &str = "CANCELLED";
 
-/// A collection's lane.
+/// The placement queue of a collection.
 pub(crate) async fn place_in_order(
     daemon: Arc<Daemon>,
     collection: String,
@@ -65,7 +64,7 @@ pub(crate) async fn place_in_order(
         let Ok((prepared, _memory)) = prepared else {
             return;
         };
-        let Some(outcome) = settle(&daemon, &ready.item, prepared).await else {
+        let Some(outcome) = described(&daemon, &ready.item, prepared).await else {
             return;
         };
         if !place(&daemon, &ready.item, outcome).await {
@@ -75,23 +74,25 @@ pub(crate) async fn place_in_order(
     }
 }
 
-/// What is to be placed, now that all before it are. `None`: the daemon drains.
-async fn settle(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
+/// The outcome of describing, now that all shapes before it are placed. `None`: the daemon drains.
+async fn described(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> Option<Outcome> {
     if let Prepared::Described(outcome) = prepared {
         return Some(*outcome);
     }
     let subject = item.clone();
     // A shape before it may have removed the reason why no description was needed.
-    let settled = blocking(daemon, move |d| match prepare(d, &subject) {
+    let described = blocking(daemon, move |d| match prepare(d, &subject) {
         Prepared::Described(outcome) => *outcome,
-        // The library sees by itself why, before it looks at this.
+        // The library finds the reason by itself, and ignores this.
         Prepared::NotNeeded => Err(failed(
             "INTERNAL",
             "GONE",
             "it was not described".to_owned(),
         )),
     });
-    let outcome = settled.await.unwrap_or_else(|panic| Err(panicked(&panic)));
+    let outcome = described
+        .await
+        .unwrap_or_else(|panic| Err(panicked(&panic)));
     (outcome.is_ok() || !daemon.is_draining()).then_some(outcome)
 }
 
@@ -105,20 +106,21 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
     let mut delay = FIRST_RETRY;
     let mut draining = daemon.drain.subscribe();
     loop {
-        let permit = Arc::clone(&daemon.placing).acquire_owned().await;
+        let permit = Arc::clone(&daemon.capacity.placing).acquire_owned().await;
         let (again, subject) = (outcome.clone(), item.clone());
-        let placed = blocking(daemon, move |d| place_apart(d, &subject, again)).await;
+        let placed = blocking(daemon, move |d| place_remotely(d, &subject, again)).await;
         drop(permit);
         let failure = match placed {
             Ok(Ok(state)) => {
                 report(daemon, item, &state);
                 break;
             }
-            // Nothing was written: there may be space again, or a restart, and the shape is still queued.
+            // Nothing was written and the shape is still queued, until there is space again or the
+            // daemon restarts.
             Ok(Err(LibraryError::Store(
                 e @ (StoreError::NoSpace { .. } | StoreError::ReadOnly { .. }),
             ))) => {
-                daemon.metrics.fault("place");
+                daemon.telemetry.metrics.fault("place");
                 tracing::error!(
                     collection = item.collection, shape = item.name, error = %e,
                     "a shape cannot be stored; trying again in {} s", delay.as_secs()
@@ -153,7 +155,7 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
 }
 
 /// Places one shape in a worker, if there is anything to place. Waits for the collection.
-fn place_apart(
+fn place_remotely(
     daemon: &Arc<Daemon>,
     item: &JobItem,
     outcome: Outcome,
@@ -161,38 +163,38 @@ fn place_apart(
     let library = &daemon.library;
     let described = match outcome {
         Ok(described) => described,
-        // To write down why not is work for nobody else.
+        // Recording a failure needs no worker.
         Err(why) => return library.place_item(item, Err(why)),
     };
-    let lent = library.lend(&item.collection, || try_to_place(daemon, item, &described));
-    match lent {
+    let placed = library.lend(&item.collection, || try_to_place(daemon, item, &described));
+    match placed {
         Ok(Ok(Ok(()))) => library.item_state(item),
         Ok(Ok(Err(why))) => library.place_item(item, Err(why)),
         Ok(Err(e)) => Err(e),
-        // The collection is gone, which is written down as well.
+        // The collection is gone, which is recorded as well.
         Err(LibraryError::NotFound { .. }) => library.place_item(item, Ok(described)),
         Err(e) => Err(e),
     }
 }
 
-/// The attempts to place one shape. The inner error is why the shape has failed; otherwise the catalog says what
-/// became of it.
+/// The attempts to place one shape. The inner error is why the shape has failed; otherwise the
+/// catalog has its state.
 fn try_to_place(
     daemon: &Arc<Daemon>,
     item: &JobItem,
     described: &Described,
 ) -> Result<Result<(), Failure>, LibraryError> {
     let library = &daemon.library;
-    let handed = library.hand_over(item, described)?;
+    let ticket = library.hand_over(item, described)?;
     let n_bytes = library.item_bytes(item)?;
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let is_cancelled = || daemon.work.progress().is_cancelled(item.job);
     let wanted = || begin.elapsed() < limit && !is_cancelled();
     loop {
-        let work = Placing::Place(&handed.words, n_bytes);
+        let work = Placing::Place(&ticket.words, n_bytes);
         let (text, out_of_memory) = match daemon.pool.place(&item.collection, work, &wanted) {
-            Ok(said) => match understood(daemon, &said)? {
+            Ok(report) => match outcome(daemon, &report)? {
                 worker::Outcome::Failed(why) if why.reason == CANCELLED => return Ok(Ok(())),
                 worker::Outcome::Failed(why) => return Ok(Err(why)),
                 worker::Outcome::State(_) | worker::Outcome::Relabelled(_) => return Ok(Ok(())),
@@ -222,12 +224,13 @@ fn try_to_place(
     }
 }
 
-/// What a worker says; what its disk says counts for this process too.
-fn understood(daemon: &Daemon, said: &serde_json::Value) -> Result<worker::Outcome, LibraryError> {
-    match worker::outcome(said) {
-        Ok(worker::Said::Outcome(outcome)) => Ok(outcome),
-        Ok(worker::Said::NoSpace(path)) => Err(StoreError::NoSpace { path }.into()),
-        Ok(worker::Said::ReadOnly(cause)) => {
+/// The outcome that a worker reports. The failure of its disk is the failure of this process's
+/// disk.
+fn outcome(daemon: &Daemon, report: &serde_json::Value) -> Result<worker::Outcome, LibraryError> {
+    match worker::read_report(report) {
+        Ok(worker::Report::Outcome(outcome)) => Ok(outcome),
+        Ok(worker::Report::NoSpace(path)) => Err(StoreError::NoSpace { path }.into()),
+        Ok(worker::Report::ReadOnly(cause)) => {
             Err(daemon.library.store().health().stop(cause).into())
         }
         Err(text) => Ok(worker::Outcome::Failed(failed(
@@ -242,10 +245,10 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
     let (collection, shape) = (&item.collection, &item.name);
     match state {
         ItemState::Done(placed) => {
-            daemon.metrics.placed(placed);
-            // What was replaced, or was there already.
+            daemon.telemetry.metrics.placed(placed);
+            // The shape that it replaced, or its own bytes if they were stored already, can go.
             if placed.outcome != crate::library::Outcome::Added {
-                daemon.freed();
+                daemon.needs_sweep();
             }
             tracing::info!(
                 collection, shape, outcome = ?placed.outcome, version = placed.version,
@@ -253,8 +256,12 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
             );
         }
         ItemState::Failed(f) => {
-            daemon.metrics.finished("failed");
-            daemon.counters.failed.fetch_add(1, Ordering::Relaxed);
+            daemon.telemetry.metrics.finished("failed");
+            daemon
+                .telemetry
+                .counters
+                .failed
+                .fetch_add(1, Ordering::Relaxed);
             tracing::warn!(
                 collection,
                 shape,
@@ -265,29 +272,29 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
             );
         }
         ItemState::Cancelled => {
-            daemon.metrics.finished("cancelled");
-            daemon.freed();
+            daemon.telemetry.metrics.finished("cancelled");
+            daemon.needs_sweep();
             tracing::info!(collection, shape, "cancelled");
         }
         ItemState::Queued | ItemState::Running(_) => {
-            tracing::error!(collection, shape, "was placed but is not over");
+            tracing::error!(collection, shape, "was placed but is not finished");
         }
     }
 }
 
-/// Labels one stale shape of the collection anew. False: none was stale, or not now. What ends its worker too often is not
-/// tried again before something changes.
+/// Relabels one stale shape of the collection. Returns false if none was stale, or none can be
+/// relabelled now. A shape that ends its worker too often is not tried again before a change.
 async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32) -> bool {
     if daemon.is_draining() || *n_deaths >= MAX_ATTEMPTS {
         return false;
     }
-    let permit = Arc::clone(&daemon.placing).acquire_owned().await;
+    let permit = Arc::clone(&daemon.capacity.placing).acquire_owned().await;
     let name = collection.to_owned();
-    let relabelled = blocking(daemon, move |d| relabel_apart(d, &name)).await;
+    let relabelled = blocking(daemon, move |d| relabel_remotely(d, &name)).await;
     drop(permit);
     let fault = |error: &str| {
-        daemon.metrics.fault("relabel");
-        tracing::error!(collection, error, "a stale shape cannot be labelled anew");
+        daemon.telemetry.metrics.fault("relabel");
+        tracing::error!(collection, error, "a stale shape cannot be relabelled");
     };
     let again = match relabelled {
         Ok(Ok(Ok(again))) => {
@@ -296,7 +303,7 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32
         }
         Ok(Ok(Err(death))) => {
             *n_deaths += 1;
-            daemon.metrics.workers_died.inc();
+            daemon.telemetry.metrics.workers_died.inc();
             fault(&death);
             return *n_deaths < MAX_ATTEMPTS;
         }
@@ -311,20 +318,20 @@ async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32
         }
     };
     if again {
-        daemon.metrics.relabelled.inc();
+        daemon.telemetry.metrics.relabelled.inc();
         daemon.notice(Notice::Changed(collection.to_owned()));
     }
     daemon.work.changed();
     again
 }
 
-/// Whether a shape was labelled anew. The inner error says what ended the worker.
-fn relabel_apart(
+/// Whether a shape was relabelled. The inner error says what ended the worker.
+fn relabel_remotely(
     daemon: &Arc<Daemon>,
     collection: &str,
 ) -> Result<Result<bool, String>, LibraryError> {
     let library = &daemon.library;
-    // Most often there is nothing to do, which needs no worker to be seen.
+    // Most often there is nothing to do, which shows without a worker.
     if !library.has_stale(collection)? {
         return Ok(Ok(false));
     }
@@ -333,12 +340,12 @@ fn relabel_apart(
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let wanted = || begin.elapsed() < limit;
     let work = Placing::Relabel(collection);
-    let said = library.lend(collection, || daemon.pool.place(collection, work, &wanted))?;
-    match said {
-        Ok(said) => match understood(daemon, &said)? {
+    let report = library.lend(collection, || daemon.pool.place(collection, work, &wanted))?;
+    match report {
+        Ok(report) => match outcome(daemon, &report)? {
             worker::Outcome::Relabelled(again) => Ok(Ok(again)),
             worker::Outcome::Failed(why) => Ok(Err(why.message)),
-            worker::Outcome::State(state) => Ok(Err(format!("a worker said {state:?}"))),
+            worker::Outcome::State(state) => Ok(Err(format!("a worker reported {state:?}"))),
         },
         Err(Ended::Stopped) => Ok(Err(format!("it took more than {} s", limit.as_secs()))),
         Err(Ended::Died { text, .. }) => Ok(Err(text)),

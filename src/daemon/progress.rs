@@ -1,6 +1,6 @@
-//! What this process is doing for each job: stages, revisions, cancellations.
+//! The state of jobs in this process: stages, revisions, cancellations.
 //!
-//! The catalog knows what is durable; the stage a shape is at is not, and lives here.
+//! The catalog holds what is durable. The stage of a shape is not, and is held here.
 
 use crate::library::JobItem;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -25,7 +25,7 @@ fn units_of(n_shapes: usize, n_bytes: u64) -> f64 {
     n_shapes as f64 + n_bytes as f64 / UNIT_BYTES
 }
 
-/// What is accepted and not placed, with an estimate of the time it takes.
+/// Accepted shapes that are not placed, with an estimate of the time that they take.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Load {
     pub(crate) n_shapes: usize,
@@ -55,16 +55,16 @@ struct LiveJob {
     cancelled: bool,
 }
 
-/// Shapes of one collection that wait to be described, and the way to its placing lane.
-struct Lane<S> {
+/// Shapes of one collection that wait to be described, and the way to its placement queue.
+struct Queue<S> {
     waiting: VecDeque<Waiting>,
     n_live: usize,
     steps: mpsc::UnboundedSender<S>,
 }
 
-/// All accepted shapes that are not placed yet. `S`: what placing lanes are told.
+/// All accepted shapes that are not placed yet. `S` is a message to a placement queue.
 pub(crate) struct Progress<S> {
-    lanes: HashMap<String, Lane<S>>,
+    queues: HashMap<String, Queue<S>>,
     /// Collections with waiting shapes; the first has the turn.
     turns: VecDeque<String>,
     jobs: HashMap<u64, LiveJob>,
@@ -74,16 +74,17 @@ pub(crate) struct Progress<S> {
     reserved: (usize, u64),
     /// Seconds that a unit of work has taken lately.
     pace: f64,
-    /// Jobs are numbered in order of acceptance; this is the last one taken up.
+    /// Jobs are numbered in order of acceptance; this is the last one added.
     highest_job: u64,
-    /// Counts changes, so that a job taken up again after a restart does not repeat its revisions soon.
+    /// Counts changes, so that a job that is resumed after a restart does not repeat its revisions
+    /// soon.
     n_changes: u64,
 }
 
 impl<S> Progress<S> {
     pub(crate) fn new() -> Self {
         Self {
-            lanes: HashMap::new(),
+            queues: HashMap::new(),
             turns: VecDeque::new(),
             jobs: HashMap::new(),
             sizes: HashMap::new(),
@@ -94,53 +95,53 @@ impl<S> Progress<S> {
         }
     }
 
-    /// The way to the lane of `collection`, if there is one.
-    pub(crate) fn lane(&self, collection: &str) -> Option<&mpsc::UnboundedSender<S>> {
-        self.lanes.get(collection).map(|l| &l.steps)
+    /// The way to the placement queue of `collection`, if there is one.
+    pub(crate) fn queue(&self, collection: &str) -> Option<&mpsc::UnboundedSender<S>> {
+        self.queues.get(collection).map(|l| &l.steps)
     }
 
-    pub(crate) fn add_lane(&mut self, collection: &str, steps: mpsc::UnboundedSender<S>) {
-        let lane = Lane {
+    pub(crate) fn add_queue(&mut self, collection: &str, steps: mpsc::UnboundedSender<S>) {
+        let queue = Queue {
             waiting: VecDeque::new(),
             n_live: 0,
             steps,
         };
-        self.lanes.insert(collection.to_owned(), lane);
+        self.queues.insert(collection.to_owned(), queue);
     }
 
-    /// Lets all lanes end when they have done what they were told.
+    /// Lets all queues end after the steps that were sent to them.
     pub(crate) fn close(&mut self) {
-        self.lanes.clear();
+        self.queues.clear();
         self.turns.clear();
     }
 
-    /// Lets the lane of a collection that is gone end, unless it still has something to do.
-    pub(crate) fn remove_idle_lane(&mut self, collection: &str) {
-        if self.lanes.get(collection).is_some_and(|l| l.n_live == 0) {
-            self.lanes.remove(collection);
+    /// Lets the queue of a collection that is gone end, unless it still has something to do.
+    pub(crate) fn remove_idle_queue(&mut self, collection: &str) {
+        if self.queues.get(collection).is_some_and(|l| l.n_live == 0) {
+            self.queues.remove(collection);
         }
     }
 
-    /// Whether a job was taken up before, as when its request is repeated.
+    /// Whether a job was added before, as when its request is repeated.
     pub(crate) fn is_known(&self, job: u64) -> bool {
         job <= self.highest_job
     }
 
-    /// Takes up a shape, after all others of its collection, whose lane must be there.
+    /// Adds a shape after all others of its collection, whose queue must exist.
     pub(crate) fn push(&mut self, waiting: Waiting) {
         let (job, collection) = (waiting.item.job, waiting.item.collection.clone());
         self.highest_job = self.highest_job.max(job);
-        let lane = self
-            .lanes
+        let queue = self
+            .queues
             .get_mut(&collection)
-            .expect("invariant: lanes come before shapes");
-        if lane.waiting.is_empty() {
+            .expect("invariant: queues come before shapes");
+        if queue.waiting.is_empty() {
             self.turns.push_back(collection);
         }
         let place = (job, waiting.item.index);
         self.sizes.insert(place, waiting.n_bytes);
-        lane.waiting.push_back(waiting);
-        lane.n_live += 1;
+        queue.waiting.push_back(waiting);
+        queue.n_live += 1;
         self.jobs.entry(job).or_default().n_live += 1;
         self.touch(job);
     }
@@ -148,14 +149,14 @@ impl<S> Progress<S> {
     /// The next shape to describe: collections take turns.
     pub(crate) fn pop(&mut self) -> Option<(Waiting, mpsc::UnboundedSender<S>)> {
         while let Some(collection) = self.turns.pop_front() {
-            let Some(lane) = self.lanes.get_mut(&collection) else {
+            let Some(queue) = self.queues.get_mut(&collection) else {
                 continue;
             };
-            let Some(waiting) = lane.waiting.pop_front() else {
+            let Some(waiting) = queue.waiting.pop_front() else {
                 continue;
             };
-            let steps = lane.steps.clone();
-            if !lane.waiting.is_empty() {
+            let steps = queue.steps.clone();
+            if !queue.waiting.is_empty() {
                 self.turns.push_back(collection);
             }
             return Some((waiting, steps));
@@ -166,8 +167,8 @@ impl<S> Progress<S> {
     /// Drops the waiting shapes of a job that `is_over` says are over.
     pub(crate) fn drop_waiting(&mut self, job: u64, is_over: impl Fn(u32) -> bool) {
         let mut dropped = Vec::new();
-        for lane in self.lanes.values_mut() {
-            lane.waiting.retain(|w| {
+        for queue in self.queues.values_mut() {
+            queue.waiting.retain(|w| {
                 let over = w.item.job == job && is_over(w.item.index);
                 if over {
                     dropped.push(w.item.clone());
@@ -191,8 +192,8 @@ impl<S> Progress<S> {
     /// Nothing of this shape is left to do.
     pub(crate) fn finish(&mut self, item: &JobItem) {
         self.sizes.remove(&(item.job, item.index));
-        if let Some(lane) = self.lanes.get_mut(&item.collection) {
-            lane.n_live = lane.n_live.saturating_sub(1);
+        if let Some(queue) = self.queues.get_mut(&item.collection) {
+            queue.n_live = queue.n_live.saturating_sub(1);
         }
         self.touch(item.job);
         if let Some(job) = self.jobs.get_mut(&item.job) {
@@ -229,19 +230,19 @@ impl<S> Progress<S> {
         self.pace += (secs / units_of(1, n_bytes) - self.pace) * PACE_WEIGHT;
     }
 
-    /// Reserves room for shapes that are being taken in.
+    /// Reserves room for shapes that are being added.
     pub(crate) fn reserve(&mut self, n_bytes: &[u64]) {
         self.reserved.0 += n_bytes.len();
         self.reserved.1 += n_bytes.iter().sum::<u64>();
     }
 
-    /// Gives back what was reserved.
+    /// Gives back reserved room.
     pub(crate) fn release(&mut self, n_bytes: &[u64]) {
         self.reserved.0 -= n_bytes.len();
         self.reserved.1 -= n_bytes.iter().sum::<u64>();
     }
 
-    /// What is accepted and not placed, and what is reserved.
+    /// Accepted shapes that are not placed, and reserved room.
     pub(crate) fn load(&self) -> Load {
         let n_shapes = self.sizes.len() + self.reserved.0;
         let n_bytes = self.sizes.values().sum::<u64>() + self.reserved.1;
@@ -256,8 +257,8 @@ impl<S> Progress<S> {
     /// Accepted shapes that are not placed yet, of one collection or of all.
     pub(crate) fn n_live(&self, collection: Option<&str>) -> usize {
         match collection {
-            Some(name) => self.lanes.get(name).map_or(0, |l| l.n_live),
-            None => self.lanes.values().map(|l| l.n_live).sum(),
+            Some(name) => self.queues.get(name).map_or(0, |l| l.n_live),
+            None => self.queues.values().map(|l| l.n_live).sum(),
         }
     }
 
@@ -305,7 +306,7 @@ mod tests {
     fn progress() -> Progress<()> {
         let mut progress = Progress::new();
         for collection in ["a", "b"] {
-            progress.add_lane(collection, mpsc::unbounded_channel().0);
+            progress.add_queue(collection, mpsc::unbounded_channel().0);
         }
         progress
     }

@@ -1,9 +1,9 @@
-//! The event log becomes messages on the event socket: after commit, in order, none left out.
+//! Publishes the event log on the event socket: after commit, in order, every event.
 //!
-//! Events are read back from the log rather than passed along by whoever caused them, so whatever was
-//! committed is published, by whichever way it came about.
+//! Events are read back from the log, not passed along by the task that caused them, so every
+//! committed event is published, whatever caused it.
 
-use crate::daemon::{Daemon, blocking};
+use crate::daemon::shared::{Daemon, Notice, blocking};
 use crate::ipc::wire::{self, event::Kind};
 use crate::ipc::{HEARTBEAT_TOPIC, convert, topic};
 use crate::library::{Event, EventKind};
@@ -17,22 +17,11 @@ use tokio::sync::mpsc;
 const BATCH: usize = 256;
 /// Time between heartbeats.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Deleted collections that heartbeats still name, so that whoever missed the deletion notices. The
-/// oldest is dropped beyond: clients may create and delete collections without end.
+/// Deleted collections that heartbeats still name, so that a subscriber that missed the deletion
+/// notices. The oldest is dropped beyond: clients may create and delete collections without end.
 const MAX_DELETED: usize = 256;
 
-/// What the publisher is told.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Notice {
-    /// Something may have been committed to the collection.
-    Changed(String),
-    /// The collection was created, which the event with this number says.
-    Created(String, u64),
-    /// Nothing more will be committed.
-    Stop,
-}
-
-/// How far the log of each collection was published.
+/// The last published event of each collection.
 struct Published {
     sequences: BTreeMap<String, u64>,
     /// Collections of these whose newest event is their deletion, oldest first.
@@ -55,7 +44,8 @@ impl Published {
     }
 }
 
-/// Publishes until it is told to stop. `published` says how far each log was published before.
+/// Publishes until it receives [`Notice::Stop`]. `published` has the last published event of each
+/// collection.
 pub(crate) async fn run(
     daemon: Arc<Daemon>,
     mut notices: mpsc::UnboundedReceiver<Notice>,
@@ -86,16 +76,16 @@ pub(crate) async fn run(
     }
 }
 
-/// Publishes what the log has beyond what was published.
+/// Publishes the events of the log that are not published yet.
 async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut Published) {
-    // Of a collection that nobody has noticed, or whose deletion is long published, nothing is left.
+    // An unknown collection, or one whose deletion was published long ago, has no entry.
     while let Some(&after) = published.sequences.get(&collection) {
         let name = collection.clone();
         let events = blocking(daemon, move |d| d.library.events_since(&name, after, BATCH)).await;
         let events = match events {
             Ok(Ok(events)) => events,
             Ok(Err(e)) => {
-                daemon.metrics.fault("publish");
+                daemon.telemetry.metrics.fault("publish");
                 tracing::error!(collection, error = %e, "the event log cannot be read");
                 return;
             }
@@ -107,7 +97,7 @@ async fn catch_up(daemon: &Arc<Daemon>, collection: String, published: &mut Publ
         for event in &events {
             let body = convert::event(&collection, event).encode_to_vec();
             daemon.outbox.event(topic(&collection), body);
-            daemon.metrics.events.inc();
+            daemon.telemetry.metrics.events.inc();
             published.advance(&collection, event);
         }
         if events.len() < BATCH {
@@ -125,7 +115,7 @@ fn send_heartbeat(daemon: &Daemon, published: &BTreeMap<String, u64>) {
         });
     let heartbeat = wire::Heartbeat {
         collections: collections.collect(),
-        instance: daemon.instance.clone(),
+        instance: daemon.identity.instance.clone(),
     };
     let event = wire::Event {
         sequence: 0,

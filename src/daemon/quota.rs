@@ -1,4 +1,4 @@
-//! What one client may have in hand: requests that are not answered, and bytes of them.
+//! Bounds the requests in flight of one client, and their bytes.
 
 use crate::config::Limits;
 use crate::daemon::fair::Client;
@@ -6,22 +6,22 @@ use crate::ipc::size::in_words;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// What each client has in hand.
+/// The requests in flight of each client.
 pub(crate) struct Quotas(Mutex<State>);
 
 struct State {
     max_requests: usize,
     max_bytes: u64,
-    clients: HashMap<Client, InHand>,
+    clients: HashMap<Client, InFlight>,
 }
 
 #[derive(Default)]
-struct InHand {
+struct InFlight {
     requests: usize,
     bytes: u64,
 }
 
-/// One request of a client; dropping it says that it is answered.
+/// One request of a client, which counts until this is dropped.
 pub(crate) struct Ticket {
     quotas: Arc<Quotas>,
     client: Client,
@@ -48,12 +48,12 @@ impl Quotas {
         state.max_bytes = limits.max_bytes_per_client.0;
     }
 
-    /// Bytes that one client may have in hand.
+    /// Bytes that one client may have in flight.
     pub(crate) fn max_bytes(&self) -> u64 {
         self.state().max_bytes
     }
 
-    /// Takes a request in hand, or says why not.
+    /// Counts a request, or returns why it may not be in flight.
     pub(crate) fn admit(self: &Arc<Self>, client: &Client, bytes: u64) -> Result<Ticket, String> {
         let mut state = self.state();
         let (max_requests, max_bytes) = (state.max_requests, state.max_bytes);
@@ -86,12 +86,12 @@ impl Quotas {
 }
 
 impl Ticket {
-    /// Whose it is.
+    /// The client of the request.
     pub(crate) fn client(&self) -> &Client {
         &self.client
     }
 
-    /// The request goes on, but its bytes are gone.
+    /// The request is still in flight, but its bytes are released.
     pub(crate) fn free_bytes(&mut self) {
         let bytes = std::mem::take(&mut self.bytes);
         if let Some(mine) = self.quotas.state().clients.get_mut(&self.client) {

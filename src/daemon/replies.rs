@@ -1,8 +1,9 @@
-//! Replies that are not sent yet, because their clients read more slowly than they are made: what each client has, and
-//! all of them together.
+//! Counts the replies that are not sent yet because their clients read slowly, for each client and
+//! in total.
 //!
-//! A client that reads is served however slowly it reads: what it asks for beyond its share waits until it has read more.
-//! One that reads nothing is disconnected when others need the memory, or when its own requests have waited long enough.
+//! A client that reads is served at its own pace: requests beyond its share wait until it has read
+//! more. A client that reads nothing is disconnected when others need the memory, or when its own
+//! requests have waited long enough.
 
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason};
@@ -12,19 +13,19 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
-/// What a frame takes beside its bytes.
+/// Bytes that a frame takes beside its content.
 const FRAME_COST: u64 = 256;
-/// Of the whole, the part that one client may have.
+/// One client may have the limit divided by this.
 const SHARE: u64 = 4;
-/// Of the whole, what clients that have something already leave to those that have nothing.
+/// Clients with unsent replies leave the limit divided by this to those that have none.
 const SPARE: u64 = 4;
-/// A client may have as much whatever others have: refusals reach it.
+/// A client may have this much whatever others have, so that refusals reach it.
 const ALWAYS: u64 = 16 << 10;
-/// Without a frame sent for as long, a client is disconnected where memory is short.
+/// A client without a sent frame for this long is disconnected if memory is short.
 const STALLED: Duration = Duration::from_secs(2);
-/// As long a request waits until its client has read more.
+/// How long a request waits until its client has read more.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Between looks at who stalls.
+/// Between checks for clients that stall.
 const LOOK: Duration = Duration::from_millis(250);
 
 /// Replies that are not sent yet.
@@ -36,7 +37,7 @@ pub(crate) struct Replies {
 struct State {
     limit: u64,
     used: u64,
-    /// Of that, what clients have whose connections are ending.
+    /// The part of `used` that belongs to connections that are ending.
     ending: u64,
     clients: HashMap<Bytes, Unsent>,
 }
@@ -46,7 +47,7 @@ struct Unsent {
     /// When a frame was last sent, or the first one made.
     progress: Instant,
     ending: bool,
-    /// Requests that wait for room. Until they know that the connection ends, this is kept.
+    /// Requests that wait for room. The entry stays until they know that the connection ends.
     waiting: usize,
 }
 
@@ -56,14 +57,14 @@ struct Waiting<'a> {
     client: &'a Bytes,
 }
 
-/// A frame that is to be sent. It counts until ZeroMQ lets go of it.
+/// A frame to be sent. It counts until libzmq releases it.
 pub(crate) struct Frame {
     bytes: Bytes,
     replies: Arc<Replies>,
     client: Bytes,
 }
 
-/// What became of a wait for room.
+/// Whether a client may be answered.
 enum Room {
     Free,
     Wait,
@@ -93,7 +94,7 @@ impl Replies {
         self.state().limit = limit;
     }
 
-    /// Bytes of all that is not sent yet.
+    /// Bytes of all replies that are not sent yet.
     pub(crate) fn used(&self) -> u64 {
         self.state().used
     }
@@ -121,7 +122,8 @@ impl Replies {
         matches!(self.state().room(client), Room::Free)
     }
 
-    /// Waits until a client has read enough to be answered. `end` is told whose connections to end meanwhile.
+    /// Waits until a client has read enough to be answered. Meanwhile `end` is called with the
+    /// clients whose connections are to be ended.
     pub(crate) async fn room(
         &self,
         client: &Bytes,
@@ -131,7 +133,7 @@ impl Replies {
         let _waiting = self.wait(client);
         loop {
             let freed = self.freed.notified();
-            // Apart: who ends a connection needs the state.
+            // Not in the match: ending a connection locks the state.
             let room = self.state().room(client);
             match room {
                 Room::Free => return Ok(()),
@@ -143,12 +145,12 @@ impl Replies {
                 }
             }
             self.end_stalled(&end);
-            // Also when nothing is freed: then somebody may have stalled for long enough.
+            // Also when nothing is freed: a client may have stalled for long enough by then.
             let _ = tokio::time::timeout(LOOK, freed).await;
         }
     }
 
-    /// Where memory is short, ends the connection that has had most for longest without a frame sent.
+    /// If memory is short, ends the connection that has had most for longest without a sent frame.
     pub(crate) fn end_stalled(&self, end: impl Fn(Bytes)) {
         let stalled = self.state().stalled();
         if let Some(client) = stalled {
@@ -191,7 +193,7 @@ impl Replies {
 }
 
 impl State {
-    /// What counts against the limit: memory that is about to come back does not.
+    /// Bytes that count against the limit: memory that is about to come back does not.
     fn taken(&self) -> u64 {
         self.used - self.ending
     }
@@ -202,7 +204,7 @@ impl State {
 
     fn take(&mut self, client: &Bytes, bytes: u64) -> bool {
         let has = self.clients.get(client).map_or(0, |c| c.bytes);
-        // The first reply may be larger than all: nothing else is there then.
+        // The first reply may be larger than the limit, since nothing else is held then.
         let fits = self.taken() == 0 || self.taken() + bytes <= self.limit;
         if !fits && has + bytes > ALWAYS {
             return false;
@@ -240,7 +242,7 @@ impl State {
         }
     }
 
-    /// Unless somebody waits or something is not sent.
+    /// Unless a request waits or a frame is not sent.
     fn forget(&mut self, client: &Bytes) {
         let idle = |unsent: &Unsent| unsent.bytes == 0 && unsent.waiting == 0;
         if self.clients.get(client).is_some_and(idle) {
@@ -286,7 +288,7 @@ impl Drop for Waiting<'_> {
     fn drop(&mut self) {
         let mut state = self.replies.state();
         if let Some(unsent) = state.clients.get_mut(self.client) {
-            // It may have been forgotten, and be another.
+            // The entry may have been forgotten and made again.
             unsent.waiting = unsent.waiting.saturating_sub(1);
             state.forget(self.client);
         }
@@ -321,18 +323,18 @@ mod tests {
         assert!(replies.has_room(&a));
         let first = replies.take(&a, frames(300_000)).ok().unwrap();
         assert!(replies.used() > 300_000);
-        // It has its share; others have nothing yet.
+        // It has its share; the other has nothing yet.
         assert!(!replies.has_room(&a) && replies.has_room(&b));
         let rest = replies.take(&b, frames(745_000)).ok().unwrap();
         let refused = replies.take(&a, frames(100_000)).err().unwrap();
         assert_eq!(refused[0].len(), 100_000);
-        // Whoever has little is told so, however much others have.
+        // A client that has little gets a small reply, however much others have.
         let c = Bytes::from("c");
         let small = replies.take(&c, frames(ALWAYS as usize / 2)).ok().unwrap();
         assert!(replies.take(&c, frames(ALWAYS as usize)).is_err());
         drop((first, small));
         assert!(replies.has_room(&a));
-        // What is about to come back is not waited for.
+        // Memory that is about to come back counts as free.
         replies.ends(&b);
         let more = replies.take(&a, frames(900_000)).ok().unwrap();
         drop((rest, more));

@@ -1,7 +1,10 @@
-//! A daemon as a service: signals, and what the service manager is told.
+//! The daemon as a service: signals, and notifications of the service manager.
 
 use crate::config::{Config, ConfigError};
-use crate::daemon::{Running, StartError, start};
+use crate::daemon::error::StartError;
+use crate::daemon::running::Running;
+use crate::daemon::shared::Control;
+use crate::daemon::start::start;
 use sd_notify::NotifyState;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::sync::Arc;
@@ -9,23 +12,14 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
-/// A drain takes no longer, by promise to the operator; some of it is kept for closing.
+/// The longest drain, as documented for the operator; part of it is left for closing.
 const DRAIN: Duration = Duration::from_secs(25);
-/// Between looks at the state, when there is no watchdog to be fed sooner.
+/// Between checks of the state, unless the watchdog must be fed sooner.
 const LOOK: Duration = Duration::from_secs(1);
 /// Open files are enough at this many.
 const MAX_FILES: u64 = 65_536;
 /// Exit status after a second SIGTERM or SIGINT, as the shell would report the signal.
 const AT_ONCE: i32 = 143;
-
-/// What the main thread is told.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Control {
-    /// Finish and end.
-    Drain,
-    /// Read the configuration again.
-    Reload,
-}
 
 /// Why the daemon could not serve.
 #[derive(Debug, thiserror::Error)]
@@ -37,8 +31,8 @@ pub enum ServeError {
     Signals(std::io::Error),
 }
 
-/// Serves until SIGTERM, SIGINT or a Drain request; a second signal ends the process at once. On SIGHUP
-/// `reload` reads the configuration again.
+/// Serves until SIGTERM, SIGINT or a Drain request; a second signal ends the process at once. On
+/// SIGHUP `reload` reads the configuration again.
 pub fn serve(
     config: Config,
     reload: impl Fn() -> Result<Config, ConfigError>,
@@ -66,17 +60,17 @@ pub fn serve(
         .map_err(ServeError::Signals)?;
     std::panic::set_hook(Box::new(|panic| tracing::error!(%panic, "panic")));
     let running = start(config)?;
-    let control = running.daemon.asked_to_drain.clone();
+    let control = running.daemon.control.clone();
     std::thread::Builder::new()
         .name("signals".to_owned())
         .spawn(move || {
             for signal in signals.forever() {
-                let told = if signal == SIGHUP {
+                let message = if signal == SIGHUP {
                     Control::Reload
                 } else {
                     Control::Drain
                 };
-                if control.send(told).is_err() {
+                if control.send(message).is_err() {
                     return;
                 }
             }
@@ -98,7 +92,7 @@ pub fn serve(
     Ok(())
 }
 
-/// Feeds the watchdog and carries out what is asked until it is to end.
+/// Feeds the watchdog and reloads the configuration, until the daemon is to drain.
 fn attend(running: &Running, reload: impl Fn() -> Result<Config, ConfigError>) {
     let watchdog = sd_notify::watchdog_enabled();
     let look = watchdog.map_or(LOOK, |w| (w / 3).min(LOOK));
@@ -112,7 +106,7 @@ fn attend(running: &Running, reload: impl Fn() -> Result<Config, ConfigError>) {
             Err(RecvTimeoutError::Timeout) => {}
         }
         let now = running.ticks();
-        // Both must have moved: a thread that hangs should be noticed.
+        // Both must have advanced, so that a thread that hangs is noticed.
         if now.0 != ticks.0 && now.1 != ticks.1 {
             ticks = now;
             fed = Instant::now();
@@ -146,9 +140,9 @@ fn reload_now(running: &Running, reload: &impl Fn() -> Result<Config, ConfigErro
     notify(&[NotifyState::Ready]);
 }
 
-/// Tells the service manager, if there is one.
+/// Notifies the service manager, if there is one.
 fn notify(state: &[NotifyState<'_>]) {
     if let Err(e) = sd_notify::notify(state) {
-        tracing::warn!(error = %e, "the service manager cannot be told");
+        tracing::warn!(error = %e, "the service manager cannot be notified");
     }
 }

@@ -1,7 +1,7 @@
-//! Space comes back: files that nothing refers to any more are removed a moment later, what is old is forgotten now and
-//! then, and room is kept for removals on a full disk.
+//! Frees disk space: removes files without a reference a moment after the reference goes, forgets
+//! old replies and jobs every hour, and keeps a reserve for removals on a full disk.
 
-use super::{Daemon, blocking};
+use crate::daemon::shared::{Daemon, blocking};
 use crate::store::objects::ORPHAN_AGE;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -9,7 +9,8 @@ use std::time::Duration;
 
 /// Time between rounds.
 const ROUND: Duration = Duration::from_secs(10);
-/// How long a file stays after its row is gone: whoever found the row before may be about to open it.
+/// How long a file stays after its row is gone: a reader that found the row before may be about to
+/// open it.
 const GRACE: Duration = Duration::from_secs(10);
 /// Rounds between looks at everything: an hour.
 const ROUNDS: u32 = 360;
@@ -23,7 +24,9 @@ pub(crate) async fn run(daemon: Arc<Daemon>) {
         let all = round == 0;
         if all {
             match blocking(&daemon, |d| d.library.forget_old()).await {
-                Ok(Ok((replies, jobs))) => tracing::debug!(replies, jobs, "forgot what is old"),
+                Ok(Ok((replies, jobs))) => {
+                    tracing::debug!(replies, jobs, "forgot old replies and jobs")
+                }
                 Ok(Err(e)) => {
                     tracing::warn!(error = %e, "old replies and jobs cannot be forgotten")
                 }
@@ -39,10 +42,10 @@ pub(crate) async fn run(daemon: Arc<Daemon>) {
             if all {
                 return store.sweep_orphans(ORPHAN_AGE);
             }
-            if d.freed.swap(false, Ordering::Relaxed)
+            if d.unswept.swap(false, Ordering::Relaxed)
                 && let Err(e) = store.release_unreferenced()
             {
-                d.freed.store(true, Ordering::Relaxed);
+                d.unswept.store(true, Ordering::Relaxed);
                 return Err(e);
             }
             store.reclaim(GRACE)
@@ -51,7 +54,7 @@ pub(crate) async fn run(daemon: Arc<Daemon>) {
             Ok(Ok(files)) if files.is_empty() => {}
             Ok(Ok(files)) => tracing::info!(n_files = files.len(), "removed files nothing needs"),
             Ok(Err(e)) => {
-                daemon.metrics.fault("sweep");
+                daemon.telemetry.metrics.fault("sweep");
                 tracing::warn!(error = %e, "files nothing needs cannot be removed");
             }
             Err(panic) => tracing::error!(panic, "removing files nothing needs panicked"),

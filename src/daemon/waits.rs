@@ -1,29 +1,36 @@
-//! Requests that wait: for a job to change, for shapes to be placed, until nothing is left to do.
-//! They hold no thread.
+//! Answers to requests that wait: for a job to change, for shapes to be placed, until no work is
+//! left. They hold no thread.
 
-use crate::daemon::requests::{Answer, draining, panic_error, panicked};
-use crate::daemon::{Daemon, blocking, reads};
+use crate::daemon::answer::{Answer, MAX_WAIT_MS, draining, panicked, refused};
+use crate::daemon::operation::Wait;
+use crate::daemon::reads::{job_to_wire, n_stale};
+use crate::daemon::shared::{Daemon, blocking};
 use crate::ipc::convert;
 use crate::ipc::wire::{self, ErrorReason, error::Subject, reply};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Longest wait of WatchJob and WaitIdle, in milliseconds.
-pub(crate) const MAX_WAIT_MS: u64 = 30_000;
-/// WatchJob answers changes no faster than this, so that a client that asks again at once does not
-/// read a job from the catalog a thousand times a second.
+/// `watch_job` reports changes no faster than this, so that a client that watches on at once does
+/// not read a job from the catalog a thousand times a second.
 const WATCH_PACE: Duration = Duration::from_millis(50);
 
-/// Reads a job and shows it.
+/// Waits for what the request names.
+pub(crate) async fn wait(daemon: &Arc<Daemon>, wait: &Wait) -> Answer {
+    match wait {
+        Wait::WatchJob(request) => watch_job(daemon, request).await,
+        Wait::WaitIdle(request) => wait_idle(daemon, request).await,
+    }
+}
+
 async fn read_job(daemon: &Arc<Daemon>, job: u64) -> Result<wire::Job, wire::Error> {
     let read = blocking(daemon, move |d| {
-        d.library.job(job).map(|j| d.job_to_wire(&j))
+        d.library.job(job).map(|j| job_to_wire(d, &j))
     })
     .await;
     match read {
         Ok(Ok(job)) => Ok(job),
-        Ok(Err(e)) => Err(convert::library_error(&e)),
-        Err(panic) => Err(panic_error(&panic)),
+        Ok(Err(e)) => Err(refused(e)),
+        Err(panic) => Err(panicked(&panic)),
     }
 }
 
@@ -60,7 +67,7 @@ fn wait_limit(ms: u64) -> Result<Duration, wire::Error> {
     ))
 }
 
-pub(crate) async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Answer {
+async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequest) -> Answer {
     let begin = tokio::time::Instant::now();
     let until = begin + wait_limit(request.wait_ms)?;
     let mut changes = daemon.work.changes();
@@ -69,7 +76,7 @@ pub(crate) async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequ
         let revision = daemon.work.progress().revision(request.job_id);
         let revision = match revision {
             Some(revision) => revision,
-            // Over, or a correction that is carried, which only the catalog knows.
+            // Finished, or a correction that is propagated, which only the catalog knows.
             None => match read_job(daemon, request.job_id).await? {
                 job if job.finished => break,
                 job => job.revision,
@@ -101,18 +108,18 @@ pub(crate) async fn watch_job(daemon: &Arc<Daemon>, request: &wire::WatchJobRequ
     ))
 }
 
-pub(crate) async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Answer {
+async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequest) -> Answer {
     let until = tokio::time::Instant::now() + wait_limit(request.wait_ms)?;
     let mut changes = daemon.work.changes();
     let mut drain = daemon.drain.subscribe();
     let name = Some(request.collection.clone()).filter(|c| !c.is_empty());
     loop {
         let collection = name.clone();
-        let counted = blocking(daemon, move |d| reads::n_stale(d, collection.as_deref())).await;
+        let counted = blocking(daemon, move |d| n_stale(d, collection.as_deref())).await;
         let n_stale = match counted {
             Ok(Ok(n)) => n,
-            Ok(Err(e)) => return Err(convert::library_error(&e)),
-            Err(panic) => return panicked(panic),
+            Ok(Err(e)) => return Err(refused(e)),
+            Err(panic) => return Err(panicked(&panic)),
         };
         let n_queued = daemon.work.progress().n_live(name.as_deref()) as u64;
         let idle = n_stale == 0 && n_queued == 0;
@@ -125,7 +132,7 @@ pub(crate) async fn wait_idle(daemon: &Arc<Daemon>, request: &wire::WaitIdleRequ
             };
             return Ok((reply::Result::WaitIdle(reply), Vec::new()));
         }
-        // Shapes in work change their stage often; only the last one's end matters.
+        // Shapes change their stage often; only the end of the last one matters.
         let pause = async {
             if n_queued > 0 {
                 while daemon.work.progress().n_live(name.as_deref()) as u64 == n_queued

@@ -1,38 +1,89 @@
-//! The work on one shape as bytes, so that another process can do it: what is asked, and what came of it.
+//! The work on one shape as bytes, so that another process can do it: the job, and its outcome.
 //!
-//! Both ends are the same program, so nothing here has a version; lengths are checked all the same.
+//! Both ends are the same program, so nothing here has a version.
 
 use super::rows::{
-    format_from_name, from_json, operator_from_name, operator_name, report_from_json,
-    report_to_json, to_json,
+    format_from_name, operator_from_name, operator_name, report_from_json, report_to_json,
 };
 use super::submit::refusal;
 use super::{Failure, LibraryError, Result};
-use crate::mesh::Format;
+use crate::mesh::{CleanReport, Format};
 use crate::pipeline::{Description, Params, describe};
-use bytemuck::Pod;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-/// What is to be described, and how.
+/// A shape to be described, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DescribeJob<'a> {
     /// The bytes of a mesh file.
     pub bytes: &'a [u8],
     /// Their format.
     pub format: Format,
-    /// How.
+    /// Parameters of the description.
     pub params: Params,
 }
 
 /// A description, or why the shape is refused.
 pub type Described = std::result::Result<Description, Failure>;
 
-/// Where the other process's bytes came from, in errors.
-const PLACE: &str = "the worker's answer";
+/// The origin of the bytes, in errors.
+const LOCATION: &str = "the worker's answer";
+
+/// [`Description`] for serde, which domain types do not know. It fails to compile if a field is
+/// missing.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "Description")]
+struct DescriptionFields {
+    area: f64,
+    #[serde(with = "report")]
+    report: CleanReport,
+    vertices: Vec<[f32; 3]>,
+    faces: Vec<[u32; 3]>,
+    mass: Vec<f32>,
+    eigenvalues: Vec<f64>,
+    eigenvectors: Vec<f32>,
+    n_eigenvectors: usize,
+    hks: Vec<f32>,
+    face_descriptors: Vec<f32>,
+    n_descriptors: usize,
+    patches: Vec<u32>,
+    face_map: Vec<u32>,
+    polygon_area: Vec<f32>,
+    signature: Vec<f32>,
+}
+
+/// A description, owned or borrowed, as serde sees it.
+#[derive(Serialize)]
+struct Encoded<'a>(#[serde(with = "DescriptionFields")] &'a Description);
+
+#[derive(Deserialize)]
+struct Decoded(#[serde(with = "DescriptionFields")] Description);
+
+/// A report as its counts by name.
+mod report {
+    use super::{LOCATION, report_from_json, report_to_json};
+    use crate::mesh::CleanReport;
+    use serde::de::Error as _;
+    use serde::{Deserialize as _, Deserializer, Serializer};
+
+    pub(super) fn serialize<S: Serializer>(
+        report: &CleanReport,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&report_to_json(report).to_string())
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<CleanReport, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        report_from_json(&text, LOCATION).map_err(D::Error::custom)
+    }
+}
 
 impl DescribeJob<'_> {
-    /// Does it in this process. `stage` is told each stage's name as it begins; when it returns false the work
-    /// stops.
+    /// Describes the shape in this process. `stage` is called with the name of each stage as it
+    /// begins; when it returns false the work stops.
     ///
     /// # Errors
     /// Why the shape is refused, or that it was stopped.
@@ -54,7 +105,7 @@ impl DescribeJob<'_> {
 }
 
 impl<'a> DescribeJob<'a> {
-    /// From what [`DescribeJob::header`] made, and the bytes.
+    /// The job of a header that [`DescribeJob::header`] made, and of the bytes.
     ///
     /// # Errors
     /// The header is not one.
@@ -66,9 +117,9 @@ impl<'a> DescribeJob<'a> {
         };
         Ok(Self {
             bytes,
-            format: format_from_name(text("format"), PLACE)?,
+            format: format_from_name(text("format"), LOCATION)?,
             params: Params {
-                operator: operator_from_name(text("operator"), PLACE)?,
+                operator: operator_from_name(text("operator"), LOCATION)?,
                 working_faces: number("working_faces")?,
                 n_eigenpairs: number("n_eigenpairs")?,
                 only_meaningful: header["only_meaningful"].as_bool().unwrap_or_default(),
@@ -78,109 +129,27 @@ impl<'a> DescribeJob<'a> {
     }
 }
 
-/// What came of it as bytes.
+/// An outcome as bytes.
 pub fn encode(outcome: &Described) -> Vec<u8> {
-    let mut out = Vec::new();
-    let d = match outcome {
-        Err(why) => {
-            out.push(0);
-            out.extend_from_slice(to_json(why).as_bytes());
-            return out;
-        }
-        Ok(d) => d,
-    };
-    out.push(1);
-    out.extend_from_slice(&d.area.to_le_bytes());
-    for n in [d.n_eigenvectors, d.n_descriptors] {
-        out.extend_from_slice(&(n as u64).to_le_bytes());
-    }
-    put(&mut out, report_to_json(&d.report).to_string().as_bytes());
-    put(&mut out, &d.vertices);
-    put(&mut out, &d.faces);
-    put(&mut out, &d.mass);
-    put(&mut out, &d.eigenvalues);
-    put(&mut out, &d.eigenvectors);
-    put(&mut out, &d.hks);
-    put(&mut out, &d.face_descriptors);
-    put(&mut out, &d.patches);
-    put(&mut out, &d.face_map);
-    put(&mut out, &d.polygon_area);
-    put(&mut out, &d.signature);
-    out
+    let outcome = outcome.as_ref().map(Encoded);
+    postcard::to_stdvec(&outcome).expect("invariant: lengths are known and memory grows")
 }
 
-/// The same back.
+/// The outcome of bytes that [`encode`] made.
 ///
 /// # Errors
-/// The bytes are not what [`encode`] makes.
+/// The bytes are no outcome, or more than one.
 pub fn decode(bytes: &[u8]) -> Result<Described> {
-    let (kind, mut rest) = bytes.split_first().ok_or_else(|| bad("it is empty"))?;
-    if *kind == 0 {
-        let text = std::str::from_utf8(rest).map_err(|e| bad(&e.to_string()))?;
-        return Ok(Err(from_json(text, PLACE)?));
-    }
-    let rest = &mut rest;
-    let area = f64::from_le_bytes(take_8(rest)?);
-    let n_eigenvectors = u64::from_le_bytes(take_8(rest)?) as usize;
-    let n_descriptors = u64::from_le_bytes(take_8(rest)?) as usize;
-    let report: Vec<u8> = take(rest)?;
-    let report = String::from_utf8(report).map_err(|e| bad(&e.to_string()))?;
-    let description = Description {
-        area,
-        report: report_from_json(&report, PLACE)?,
-        vertices: take(rest)?,
-        faces: take(rest)?,
-        mass: take(rest)?,
-        eigenvalues: take(rest)?,
-        eigenvectors: take(rest)?,
-        n_eigenvectors,
-        hks: take(rest)?,
-        face_descriptors: take(rest)?,
-        n_descriptors,
-        patches: take(rest)?,
-        face_map: take(rest)?,
-        polygon_area: take(rest)?,
-        signature: take(rest)?,
-    };
+    let (outcome, rest): (std::result::Result<Decoded, Failure>, _) =
+        postcard::take_from_bytes(bytes).map_err(|e| bad(&e.to_string()))?;
     if !rest.is_empty() {
         return Err(bad(&format!("{} bytes are left", rest.len())));
     }
-    Ok(Ok(description))
+    Ok(outcome.map(|decoded| decoded.0))
 }
 
 fn bad(message: &str) -> LibraryError {
-    super::rows::damaged(PLACE, message)
-}
-
-fn put<T: Pod>(out: &mut Vec<u8>, values: &[T]) {
-    let bytes: &[u8] = bytemuck::cast_slice(values);
-    out.extend_from_slice(&(bytes.len() as u64).to_le_bytes());
-    out.extend_from_slice(bytes);
-}
-
-fn take_8(rest: &mut &[u8]) -> Result<[u8; 8]> {
-    let (head, tail) = rest
-        .split_first_chunk()
-        .ok_or_else(|| bad("it is cut short"))?;
-    *rest = tail;
-    Ok(*head)
-}
-
-fn take<T: Pod>(rest: &mut &[u8]) -> Result<Vec<T>> {
-    let n_bytes = u64::from_le_bytes(take_8(rest)?);
-    let n_bytes = usize::try_from(n_bytes)
-        .ok()
-        .filter(|n| *n <= rest.len() && n.is_multiple_of(size_of::<T>()))
-        .ok_or_else(|| {
-            bad(&format!(
-                "an array of {n_bytes} bytes, but {} are left",
-                rest.len()
-            ))
-        })?;
-    let (head, tail) = rest.split_at(n_bytes);
-    *rest = tail;
-    let values = head.chunks_exact(size_of::<T>());
-    Ok(values.map(bytemuck::pod_read_unaligned).collect())
+    super::rows::damaged(LOCATION, message)
 }
 
 #[cfg(test)]
@@ -205,6 +174,8 @@ mod tests {
         assert!(outcome.is_ok(), "{outcome:?}");
         let bytes = encode(&outcome);
         assert_eq!(decode(&bytes).unwrap(), outcome);
+        let longer = [&bytes[..], &[0]].concat();
+        assert!(decode(&longer).is_err());
         for cut in (0..bytes.len()).step_by(97).skip(1) {
             assert!(decode(&bytes[..cut]).is_err(), "{cut}");
         }

@@ -48,8 +48,8 @@ fault(
 )
 fault(
     "R1", "r1-queue-forgotten", "forget at start what was accepted and not placed",
-    "src/daemon/mod.rs", "it daemon::life::kill_9_loses_nothing_that_was_accepted",
-    ("    daemon.take_up_items(queued);\n", "    if !FAULT {\n        daemon.take_up_items(queued);\n    }\n"),
+    "src/daemon/start.rs", "it daemon::life::kill_9_loses_nothing_that_was_accepted",
+    ("    daemon.resume_items(queued);\n", "    if !FAULT {\n        daemon.resume_items(queued);\n    }\n"),
 )
 fault(
     "R1", "r1-done-in-advance", "write down that a shape is placed before it is",
@@ -269,7 +269,7 @@ fault(
 fault(
     "R10", "r10-queue-unbounded", "take into the queue whatever comes",
     "src/daemon/intake.rs", "it daemon::overload::ten_times_too_much_from_64_clients_is_refused_politely",
-    ("        if queued + asked > limit {", "        if queued + asked > limit && !FAULT {"),
+    ("        if queued + requested > limit {", "        if queued + requested > limit && !FAULT {"),
 )
 fault(
     "R10", "r10-no-delay", "refuse without a delay",
@@ -281,15 +281,15 @@ fault(
 )
 fault(
     "R10", "r10-no-deadline", "ignore the deadline of a request",
-    "src/daemon/requests.rs", "it daemon::overload::a_deadline_is_answered_when_it_passes",
-    ("        let ms = self.incoming.request.deadline_ms;\n        (ms > 0)", "        let ms = self.incoming.request.deadline_ms;\n        (ms > 0 && !FAULT)"),
+    "src/daemon/incoming.rs", "it daemon::overload::a_deadline_is_answered_when_it_passes",
+    ("        let ms = self.deadline_ms;\n        (ms > 0)", "        let ms = self.deadline_ms;\n        (ms > 0 && !FAULT)"),
 )
 fault(
     "R10", "r10-late-changes", "keep a request waiting beyond its deadline while its collection is busy",
-    "src/daemon/requests.rs", "it daemon::stages::deadlines_are_kept_whatever_keeps_the_collection_busy",
+    "src/daemon/in_flight.rs", "it daemon::stages::deadlines_are_kept_whatever_keeps_the_collection_busy",
     (
-        "        let done = match self.until_cut(done).await {",
-        "        let done = match if FAULT { Ok(done.await) } else { self.until_cut(done).await } {",
+        "        let done = match self.until_interrupted(&daemon, done).await {",
+        "        let done = match if FAULT { Ok(done.await) } else { self.until_interrupted(&daemon, done).await } {",
     ),
 )
 fault(
@@ -299,8 +299,8 @@ fault(
 )
 fault(
     "R10", "r10-going-on-untold", "say of a change that goes on that it was not begun",
-    "src/daemon/requests.rs", "it daemon::answering::a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again",
-    ("self.cut(&daemon, why, Reached::GoesOn),", "self.cut(&daemon, why, if FAULT { Reached::NotBegun } else { Reached::GoesOn }),"),
+    "src/daemon/in_flight.rs", "it daemon::answering::a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again",
+    ("self.interrupt(&daemon, why, Effect::Continues),", "self.interrupt(&daemon, why, if FAULT { Effect::NotBegun } else { Effect::Continues }),"),
 )
 fault(
     "R10", "r10-nobody-makes-way", "let connections that hang keep new ones out",
@@ -309,7 +309,7 @@ fault(
 )
 fault(
     "R10", "r10-memory-for-nothing", "set memory aside for the bodies that are announced",
-    "src/daemon/http/mod.rs", "it daemon::http_abuse::connections_that_hang_make_way_for_monitors_and_viewers",
+    "src/daemon/http/server.rs", "it daemon::http_abuse::connections_that_hang_make_way_for_monitors_and_viewers",
     (
         "            let mut memory = self.hands.memory(0).ok_or_else(full)?;",
         "            let announced = if FAULT { announced * PER_BODY_BYTE } else { 0 };\n            let mut memory = self.hands.memory(announced).ok_or_else(full)?;",
@@ -332,16 +332,16 @@ fault(
 )
 fault(
     "R10", "r10-passed-over", "pass over what a request has beyond what is known",
-    "src/daemon/requests.rs", "it daemon::refusing::frames_and_values_beyond_those_that_are_known_are_refused",
+    "src/daemon/dispatch.rs", "it daemon::refusing::frames_and_values_beyond_those_that_are_known_are_refused",
     (
-        "        if let Err(error) = convert::check_request(&body, incoming.frames.len()) {",
-        "        if let Some(error) = convert::check_request(&body, incoming.frames.len()).err().filter(|_| !FAULT) {",
+        "    operation.check(incoming.frames.len())?;\n",
+        "    if !FAULT {\n        operation.check(incoming.frames.len())?;\n    }\n",
     ),
 )
 # R11: isolation
 fault(
     "R11", "r11-one-attempt", "give up after the first attempt",
-    "src/daemon/work.rs", "it daemon::isolation::poison_fails_alone_and_can_be_retried",
+    "src/daemon/describing.rs", "it daemon::isolation::poison_fails_alone_and_can_be_retried",
     ("            if attempts >= MAX_ATTEMPTS {", "            if attempts >= MAX_ATTEMPTS || FAULT {"),
 )
 fault(
@@ -372,20 +372,20 @@ fault(
 )
 fault(
     "R11", "r11-answered-in-the-daemon", "answer what computes in the daemon itself",
-    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    "src/daemon/remote.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
     (
         "    let config = daemon.config();\n    let limit",
-        "    if FAULT && subjects(body).1.contains(&\"abort\") {\n        // As it would be there.\n        std::process::abort();\n    }\n    let config = daemon.config();\n    let limit",
+        "    if FAULT && format!(\"{work:?}\").contains(\"\\\"abort\\\"\") {\n        // As it would be there.\n        std::process::abort();\n    }\n    let config = daemon.config();\n    let limit",
     ),
 )
 fault(
     "R11", "r11-answered-for-ever", "let the answer to a request take for ever",
-    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    "src/daemon/remote.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
     ("    let in_time = || begin.elapsed() < limit && wanted();", "    let in_time = || (begin.elapsed() < limit || FAULT) && wanted();"),
 )
 fault(
     "R11", "r11-answered-for-nobody", "go on with an answer that nobody waits for any more",
-    "src/daemon/asked.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
+    "src/daemon/remote.rs", "it daemon::answering::what_poisons_an_answer_costs_that_request_alone",
     ("waiting.strong_count() > 0", "waiting.strong_count() > 0 || FAULT"),
 )
 fault(
@@ -440,22 +440,22 @@ fault(
 )
 fault(
     "R13", "r13-topic-of-any-length", "take subscriptions of any length",
-    "src/daemon/sockets.rs", "it daemon::security::topics_and_frames_beyond_the_limits_end_their_connection_only",
+    "src/daemon/bind.rs", "it daemon::security::topics_and_frames_beyond_the_limits_end_their_connection_only",
     ("    publisher.set_maxmsgsize(MAX_SUBSCRIPTION_BYTES)?;", "    publisher.set_maxmsgsize(if FAULT { -1 } else { MAX_SUBSCRIPTION_BYTES })?;"),
 )
 fault(
     "R13", "r13-waits-on", "let what waits go on when its key is revoked",
-    "src/daemon/requests.rs", "it daemon::security::what_waits_ends_when_its_key_is_revoked",
-    ("            () = self.revoked() => Err(Cut::Revoked),", "            () = self.revoked(), if !FAULT => Err(Cut::Revoked),"),
+    "src/daemon/in_flight.rs", "it daemon::security::what_waits_ends_when_its_key_is_revoked",
+    ("            () = self.revoked(daemon) => Err(Interruption::KeyRevoked),", "            () = self.revoked(daemon), if !FAULT => Err(Interruption::KeyRevoked),"),
 )
 fault(
     "R13", "r13-client-of-anybody", "give one key the replies of another",
-    "src/daemon/writes.rs", "it daemon::security::a_client_id_belongs_to_the_key_that_uses_it",
+    "src/daemon/operation.rs", "it daemon::security::a_client_id_belongs_to_the_key_that_uses_it",
     ("        client_id: match owner {", "        client_id: match owner.filter(|_| !FAULT) {"),
 )
 fault(
     "R13", "r13-no-token", "ask nobody for the token",
-    "src/daemon/http/mod.rs", "it viewing::beyond_this_machine_a_token_opens_what_there_is",
+    "src/daemon/http/route.rs", "it viewing::beyond_this_machine_a_token_opens_what_there_is",
     ("        if !open && !self.guard.knows(", "        if !open && !FAULT && !self.guard.knows("),
 )
 fault(
@@ -483,7 +483,7 @@ fault(
 )
 fault(
     "R13", "r13-turn-kept-while-a-file-hangs", "keep everybody waiting for a file that hangs",
-    "src/daemon/requests.rs", "it daemon::paths::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
+    "src/daemon/dispatch.rs", "it daemon::paths::a_file_that_hangs_stalls_the_request_that_names_it_and_no_other",
     ("        if may_hang {\n", "        if may_hang && !FAULT {\n"),
 )
 FLOOD = "it daemon::flood::memory_is_bounded_whatever_clients_do_not_do"
@@ -495,18 +495,18 @@ fault(
 )
 fault(
     "R13", "r13-unfinished-messages", "take any number of bytes of unfinished messages",
-    "src/daemon/sockets.rs", FLOOD,
-    ("            max_held: i64", "            max_held: if FAULT { i64::MAX } else { 0 } | i64"),
+    "src/daemon/bind.rs", FLOOD,
+    ("        max_held: i64", "        max_held: if FAULT { i64::MAX } else { 0 } | i64"),
 )
 fault(
     "R13", "r13-subscriptions", "take any number of subscriptions",
-    "src/daemon/sockets.rs", FLOOD,
+    "src/daemon/bind.rs", FLOOD,
     ("        max_subscriptions: MAX_SUBSCRIPTIONS,", "        max_subscriptions: if FAULT { 0 } else { MAX_SUBSCRIPTIONS },"),
 )
 fault(
     "R13", "r13-all-files", "leave no files beside those of connections",
-    "src/daemon/sockets.rs", "it daemon::flood::ten_thousand_connections_leave_a_good_client_served",
-    ("(files - kept).min(", "(if FAULT { files } else { files - kept }).min("),
+    "src/daemon/bind.rs", "it daemon::flood::ten_thousand_connections_leave_a_good_client_served",
+    ("(files - reserved).min(", "(if FAULT { files } else { files - reserved }).min("),
 )
 # R14: the unit
 fault(

@@ -1,12 +1,14 @@
 //! Checks promises of the layout and the documents that the compiler does not check. Every check is
 //! itself tested with planted faults.
 
+mod circles;
 mod code;
 mod docs;
 mod figures;
 mod words;
 
 use crate::harness::coseg;
+use circles::circles;
 use code::{Flow, code_faults};
 use docs::{commands_in, has_flag, link_faults};
 use figures::{accuracy_faults, demo_faults};
@@ -67,6 +69,16 @@ fn the_code_keeps_to_the_layout() {
         faults.extend(code_faults(&flow("src"), &file, &text));
     }
     assert_none(&faults);
+}
+
+/// Folders whose files do not name each other in a circle.
+const STRAIGHT: [&str; 1] = ["src/daemon"];
+
+#[test]
+fn files_do_not_name_each_other_in_a_circle() {
+    for folder in STRAIGHT {
+        assert_none(&circles(&files(&root().join(folder), "rs")));
+    }
 }
 
 #[test]

@@ -1,8 +1,10 @@
-//! What the viewer asks, as the requests that any client could send; JSON, or packs of arrays, come back.
+//! Turns the viewer's requests into those that any client could send, and the replies into JSON or
+//! packs of arrays.
 
-use super::hands::{Kept, full};
+use super::hands::{Reserved, full};
+use super::page::unexpected;
 use super::runs::{Run, labels_of};
-use super::{Server, unexpected};
+use super::server::Server;
 use crate::ipc::convert;
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::json;
@@ -18,7 +20,7 @@ use std::mem::size_of;
 /// Portraits of one answer.
 const MAX_PORTRAITS: u32 = 64;
 
-/// What is answered.
+/// The body of a page.
 pub(super) struct Found {
     pub(super) kind: &'static str,
     pub(super) bytes: Bytes,
@@ -26,10 +28,10 @@ pub(super) struct Found {
 
 type Answer = Result<Found, wire::Error>;
 
-/// Asks, and takes the reply of the variant named with its frames.
-macro_rules! ask {
+/// Sends the request of the named variant, and returns its reply with the frames.
+macro_rules! request {
     ($server:expr, $variant:ident($body:expr)) => {
-        ask!($server, $variant($body), None)
+        request!($server, $variant($body), None)
     };
     ($server:expr, $variant:ident($body:expr), $frames:expr) => {
         match $server.ask(Body::$variant($body), $frames).await? {
@@ -74,24 +76,27 @@ fn bad(reason: ErrorReason, field: &str, message: String) -> wire::Error {
     convert::field_error(reason, field, message)
 }
 
-/// JSON, for which memory was set aside.
-fn json_page(text: Kept<String>) -> Found {
-    let Kept { it, memory } = text;
-    let it = Bytes::from(it);
+/// JSON, for which memory is reserved.
+fn json_page(text: Reserved<String>) -> Found {
+    let Reserved { value, memory } = text;
+    let value = Bytes::from(value);
     Found {
         kind: "application/json",
-        bytes: Kept { it, memory }.into_bytes(),
+        bytes: Reserved { value, memory }.into_bytes(),
     }
 }
 
-/// Makes JSON of what can be large, off the threads that wait.
+/// Makes JSON that can be large, off the threads that wait.
 async fn json_of(server: &Server, make: impl FnOnce() -> Value + Send + 'static) -> Answer {
-    let it = server.hands.work(move || make().to_string()).await?;
-    let memory = server.hands.memory(it.capacity() as u64).ok_or_else(full)?;
-    Ok(json_page(Kept { it, memory }))
+    let value = server.hands.work(move || make().to_string()).await?;
+    let memory = server
+        .hands
+        .memory(value.capacity() as u64)
+        .ok_or_else(full)?;
+    Ok(json_page(Reserved { value, memory }))
 }
 
-/// Answers what changes nothing.
+/// Answers a request that changes nothing.
 pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]) -> Answer {
     let query = Query(query);
     match path {
@@ -105,7 +110,7 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
                 shape: query.text("shape")?,
                 limit: query.number("limit")?,
             };
-            let (reply, _) = ask!(server, Nearest(request))?;
+            let (reply, _) = request!(server, Nearest(request))?;
             json_of(server, move || {
                 let found = reply.neighbors.iter();
                 let found: Vec<Value> = found.map(|n| json!([n.shape, n.distance])).collect();
@@ -119,7 +124,7 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
                 sequence: query.number("since")?,
                 limit: query.number("limit")?,
             };
-            let (reply, _) = ask!(server, EventsSince(request))?;
+            let (reply, _) = request!(server, EventsSince(request))?;
             json_of(server, move || {
                 let events: Vec<Value> = reply.events.iter().map(json::event).collect();
                 json!({ "events": events, "more": reply.more })
@@ -137,14 +142,14 @@ fn unknown(path: &str) -> wire::Error {
 
 async fn library(server: &Server) -> Answer {
     let request = wire::ListCollectionsRequest {};
-    let (reply, _) = ask!(server, ListCollections(request))?;
+    let (reply, _) = request!(server, ListCollections(request))?;
     let (queues, queued, at_work) = {
         let progress = server.daemon.work.progress();
         let of = |c: &wire::Collection| progress.n_live(c.spec.as_ref().map(|s| s.name.as_str()));
         let queues: Vec<usize> = reply.collections.iter().map(of).collect();
         (queues, progress.n_live(None), progress.n_at_stages())
     };
-    let instance = server.daemon.instance.clone();
+    let instance = server.daemon.identity.instance.clone();
     let edit = server.check_edit().is_ok();
     json_of(server, move || {
         let about = |(c, n_queued): (&wire::Collection, usize)| {
@@ -172,7 +177,7 @@ async fn collection(server: &Server, name: String) -> Answer {
     let request = wire::DescribeCollectionRequest {
         collection: name.clone(),
     };
-    let (reply, _) = ask!(server, DescribeCollection(request))?;
+    let (reply, _) = request!(server, DescribeCollection(request))?;
     let begin = move || {
         let about = json::collection(&reply.collection.unwrap_or_default());
         format!("{{\"collection\":{about},\"shapes\":[")
@@ -186,7 +191,7 @@ async fn collection(server: &Server, name: String) -> Answer {
             page_token,
             ..Default::default()
         };
-        let (reply, _) = ask!(server, ListShapes(request))?;
+        let (reply, _) = request!(server, ListShapes(request))?;
         page_token = reply.next_page_token;
         let held = text.capacity();
         let write = move || {
@@ -209,10 +214,13 @@ async fn collection(server: &Server, name: String) -> Answer {
         text.pop();
     }
     text.push_str("]}");
-    Ok(json_page(Kept { it: text, memory }))
+    Ok(json_page(Reserved {
+        value: text,
+        memory,
+    }))
 }
 
-/// Asks for a pack, whose size nobody knows before it is there.
+/// Requests a pack. Its size is unknown before it comes, so memory for the largest is reserved.
 async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
     let collection = query.text("collection")?;
     let detail = match query.find("detail") {
@@ -237,7 +245,7 @@ async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
                 page_token: after.to_string(),
                 ..Default::default()
             };
-            let (reply, _) = ask!(server, ListShapes(request))?;
+            let (reply, _) = request!(server, ListShapes(request))?;
             reply.shapes.into_iter().map(|s| s.name).collect()
         }
     };
@@ -247,10 +255,10 @@ async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
         detail: detail.into(),
     };
     let memory = server.hands.memory_of_answer().await?;
-    let (reply, frames) = ask!(server, GetPortraits(request))?;
+    let (reply, frames) = request!(server, GetPortraits(request))?;
     let pack = FrameReader::new(&frames).file(reply.pack.as_ref(), "pack");
-    let it = pack.map_err(|e| convert::frame_error(&e))?.clone();
-    Ok(pack_page(Kept { it, memory }))
+    let value = pack.map_err(|e| convert::frame_error(&e))?.clone();
+    Ok(pack_page(Reserved { value, memory }))
 }
 
 async fn map(server: &Server, query: &Query<'_>) -> Answer {
@@ -262,14 +270,14 @@ async fn map(server: &Server, query: &Query<'_>) -> Answer {
         ..Default::default()
     };
     let memory = server.hands.memory_of_answer().await?;
-    let (reply, frames) = ask!(server, GetFunctionalMap(request))?;
+    let (reply, frames) = request!(server, GetFunctionalMap(request))?;
     let pack = move || portrait::map(&from, &to, &reply, &frames);
     let pack = server.hands.work(pack).await?;
-    let it = pack.map_err(|e| convert::frame_error(&e))?.into();
-    Ok(pack_page(Kept { it, memory }))
+    let value = pack.map_err(|e| convert::frame_error(&e))?.into();
+    Ok(pack_page(Reserved { value, memory }))
 }
 
-fn pack_page(pack: Kept<Bytes>) -> Found {
+fn pack_page(pack: Reserved<Bytes>) -> Found {
     Found {
         kind: "application/octet-stream",
         bytes: pack.into_bytes(),
@@ -299,33 +307,36 @@ struct Undo {
     collection: String,
 }
 
-/// Reads the body of a change, off the threads that wait. Its memory is given back when what was
-/// read is dropped.
+/// Parses the body of a change, off the threads that wait. Its memory is given back when the parsed
+/// value is dropped.
 async fn parsed<T: serde::de::DeserializeOwned + Send + 'static>(
     server: &Server,
-    sent: Kept<Vec<u8>>,
-) -> Result<Kept<T>, wire::Error> {
-    let Kept { it: bytes, memory } = sent;
+    sent: Reserved<Vec<u8>>,
+) -> Result<Reserved<T>, wire::Error> {
+    let Reserved {
+        value: bytes,
+        memory,
+    } = sent;
     let read = move || serde_json::from_slice(&bytes);
-    let it = server.hands.work(read).await?.map_err(|e| {
+    let value = server.hands.work(read).await?.map_err(|e| {
         let text = format!("the body is not what is expected: {e}");
         let code = wire::ErrorCode::InvalidArgument;
         convert::error(code, ErrorReason::MalformedMessage, text)
     })?;
-    Ok(Kept { it, memory })
+    Ok(Reserved { value, memory })
 }
 
-/// Carries out a change.
-pub(super) async fn change(server: &Server, path: &str, sent: Kept<Vec<u8>>) -> Answer {
+/// Makes a change.
+pub(super) async fn change(server: &Server, path: &str, sent: Reserved<Vec<u8>>) -> Answer {
     match path {
         "name" => {
-            let wish = parsed::<NameLabel>(server, sent).await?.it;
+            let change = parsed::<NameLabel>(server, sent).await?.value;
             let request = wire::NameLabelRequest {
-                collection: wish.collection,
-                label: wish.label,
-                name: wish.name,
+                collection: change.collection,
+                label: change.label,
+                name: change.name,
             };
-            let (reply, _) = ask!(server, NameLabel(request))?;
+            let (reply, _) = request!(server, NameLabel(request))?;
             json_of(server, move || {
                 let label = reply.label.as_ref().map(json::label);
                 json!({ "label": label })
@@ -334,11 +345,11 @@ pub(super) async fn change(server: &Server, path: &str, sent: Kept<Vec<u8>>) -> 
         }
         "correct" => correct(server, parsed(server, sent).await?).await,
         "undo" => {
-            let wish = parsed::<Undo>(server, sent).await?.it;
+            let change = parsed::<Undo>(server, sent).await?.value;
             let request = wire::UndoRequest {
-                collection: wish.collection,
+                collection: change.collection,
             };
-            let (reply, _) = ask!(server, Undo(request))?;
+            let (reply, _) = request!(server, Undo(request))?;
             json_of(
                 server,
                 move || json!({ "change": reply.change, "n_left": reply.n_left }),
@@ -349,24 +360,30 @@ pub(super) async fn change(server: &Server, path: &str, sent: Kept<Vec<u8>>) -> 
     }
 }
 
-async fn correct(server: &Server, wish: Kept<Correct>) -> Answer {
-    let Kept { it: wish, memory } = wish;
-    // How large the shape is decides what is laid out, not what the request says.
+async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
+    let Reserved {
+        value: correction,
+        memory,
+    } = sent;
+    // The size of the shape decides how many labels are expanded, not the request.
     let request = wire::GetShapeRequest {
-        collection: wish.collection.clone(),
-        shape: wish.shape.clone(),
+        collection: correction.collection.clone(),
+        shape: correction.shape.clone(),
     };
-    let (reply, _) = ask!(server, GetShape(request))?;
+    let (reply, _) = request!(server, GetShape(request))?;
     let n = reply.shape.unwrap_or_default().n_polygons;
-    if wish.n_polygons != n {
-        let message = format!("n_polygons is {}, but the shape has {n}", wish.n_polygons);
+    if correction.n_polygons != n {
+        let message = format!(
+            "n_polygons is {}, but the shape has {n}",
+            correction.n_polygons
+        );
         return Err(bad(ErrorReason::LabelCount, "n_polygons", message));
     }
     // The labels, and the frame they are copied to.
     let needed = n * size_of::<i32>() as u64;
     let mut held = server.hands.memory(2 * needed).ok_or_else(full)?;
-    let runs = wish.runs;
-    let laid_out = move || {
+    let runs = correction.runs;
+    let expand = move || {
         let labels = labels_of(usize::try_from(n).unwrap_or(usize::MAX), &runs)?;
         drop((runs, memory));
         let mut frames = FrameWriter::default();
@@ -375,20 +392,20 @@ async fn correct(server: &Server, wish: Kept<Correct>) -> Answer {
     };
     let (labels, frames) = server
         .hands
-        .work(laid_out)
+        .work(expand)
         .await?
         .map_err(|message: String| bad(ErrorReason::FieldRange, "runs", message))?;
     held.shrink_to(needed);
-    let frames = Kept {
-        it: frames,
+    let frames = Reserved {
+        value: frames,
         memory: held,
     };
     let request = wire::CorrectLabelsRequest {
-        collection: wish.collection,
-        shape: wish.shape,
+        collection: correction.collection,
+        shape: correction.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
     };
-    let (done, _) = ask!(server, CorrectLabels(request), Some(frames))?;
+    let (done, _) = request!(server, CorrectLabels(request), Some(frames))?;
     json_of(server, move || {
         json!({
             "version": done.version,

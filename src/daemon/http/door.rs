@@ -1,11 +1,13 @@
-//! Connections: how many there are, which one makes way for a new one, and how long a peer may keep
-//! the daemon waiting.
+//! Accepts connections, and bounds their number and the time that a peer may keep the daemon
+//! waiting.
 //!
-//! Who comes cannot be known before a request is read, so nothing can be set aside for monitoring.
-//! In its place a new connection always gets in: where all places are taken, the one goes that has
-//! kept the daemon waiting for longest.
+//! The purpose of a connection is unknown until a request is read, so no place can be reserved for
+//! monitoring. Instead, a new connection always gets in: if all places are taken, the connection
+//! that has kept the daemon waiting for longest is closed.
 
-use super::Server;
+use super::connection::{Connection, PEER_TIME};
+use super::route::respond;
+use super::server::Server;
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -15,7 +17,7 @@ use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, ready};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Notify;
@@ -24,39 +26,12 @@ use tokio::time::Sleep;
 
 /// Connections at a time.
 const MAX_CONNECTIONS: usize = 128;
-/// For the head of a request, also the first and the next on a connection that is kept open; for
-/// its body; and for the next [`PACE`] bytes of an answer to be taken.
-pub(super) const PEER_TIME: Duration = Duration::from_secs(10);
-/// After which a connection ends whatever it is at.
+/// Time after which a connection ends, whatever its state.
 const CONNECTION_TIME: Duration = Duration::from_secs(900);
 /// Bytes of a request's head, and of what is read ahead of it.
 const MAX_HEAD: usize = 64 << 10;
 /// Bytes of an answer that a peer must take within [`PEER_TIME`].
 const PACE: usize = 64 << 10;
-
-/// One connection as the door sees it.
-pub(super) struct Connection {
-    /// Since when the daemon waits for the peer; none while it works for it.
-    waiting: Mutex<Option<Instant>>,
-    changed: Arc<Notify>,
-}
-
-impl Connection {
-    /// The daemon works for it, and it keeps its place.
-    pub(super) fn works(&self) {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = None;
-    }
-
-    /// The daemon waits for a request, the rest of one, or that an answer is read.
-    pub(super) fn waits(&self) {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
-        self.changed.notify_one();
-    }
-
-    fn waiting_since(&self) -> Option<Instant> {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
 
 struct Place {
     connection: Arc<Connection>,
@@ -75,7 +50,7 @@ impl Door {
         self.places.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Makes a place free if none is, and says whether one is.
+    /// Frees a place if none is free, and returns whether one is.
     fn has_room(&self) -> bool {
         let mut places = self.places();
         if places.len() < MAX_CONNECTIONS {
@@ -124,16 +99,13 @@ pub(super) async fn serve(server: Arc<Server>, listener: TcpListener) {
         while !door.has_room() {
             door.changed.notified().await;
         }
-        let connection = Arc::new(Connection {
-            waiting: Mutex::new(Some(Instant::now())),
-            changed: Arc::clone(&door.changed),
-        });
+        let connection = Arc::new(Connection::new(Arc::clone(&door.changed)));
         let leaving = Leaving {
             door: Arc::clone(&door),
             number,
         };
         let attended = attend(Arc::clone(&server), stream, Arc::clone(&connection));
-        // Within the lock: it cannot have left before it is there.
+        // Within the lock: the task cannot remove its place before it is inserted.
         let mut places = door.places();
         let task = tokio::spawn(async move {
             let _leaving = leaving;
@@ -150,7 +122,7 @@ async fn attend(server: Arc<Server>, stream: TcpStream, connection: Arc<Connecti
     let _ = stream.set_nodelay(true);
     let service = service_fn(|request| async {
         connection.works();
-        let page = server.respond(request, &connection).await;
+        let page = respond(&server, request, &connection).await;
         connection.waits();
         Ok::<_, Infallible>(page)
     });
@@ -168,9 +140,9 @@ async fn attend(server: Arc<Server>, stream: TcpStream, connection: Arc<Connecti
 /// A stream that fails when its peer does not take what is written.
 struct Paced {
     stream: TcpStream,
-    /// Runs while something waits to be taken.
+    /// Runs while bytes wait to be taken.
     until: Option<Pin<Box<Sleep>>>,
-    /// Bytes that were taken since it runs.
+    /// Bytes that were taken since it began to run.
     taken: usize,
 }
 
@@ -242,7 +214,7 @@ impl AsyncWrite for Paced {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        // Asked for when everything was written.
+        // Called when everything was written.
         self.take_breath();
         Pin::new(&mut self.stream).poll_flush(context)
     }

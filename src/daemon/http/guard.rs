@@ -1,30 +1,30 @@
-//! Who may ask: hosts that are this machine, pages that are the viewer's own, and the token where
-//! one is asked for.
+//! Checks requests: the host must be this machine, a page the viewer's own, and the token the right
+//! one, if one is required.
 
 use super::token::Token;
 use hyper::Uri;
 use hyper::header::{self, HeaderMap, HeaderName, HeaderValue};
 use std::net::IpAddr;
 
-/// Header without which nothing is changed.
+/// The header that every change must have.
 const GUARD: HeaderName = HeaderName::from_static("x-coseg");
-/// What a browser says of the page that asks.
+/// The header in which a browser describes the page that sends a request.
 const FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
-/// The cookie that a browser shows in place of the token it was opened with.
+/// The cookie that a browser sends in place of the token that opened the viewer.
 const COOKIE: &str = "coseg_token";
 
-/// What is asked of those who ask.
+/// The checks of one endpoint.
 pub(super) struct Guard {
-    /// Only names of this machine's loopback are its own.
+    /// Only the names of this machine's loopback are allowed as hosts.
     pub(super) local: bool,
-    /// What must be shown, if anything.
+    /// The token that requests must have, if any.
     pub(super) token: Option<Token>,
     /// Whether monitoring needs no token.
     pub(super) open_monitoring: bool,
 }
 
 impl Guard {
-    /// A name that somebody made to point to this machine is not its own.
+    /// Refuses hosts that are not this machine's, although their names lead to it.
     pub(super) fn check_host(&self, uri: &Uri, headers: &HeaderMap) -> Result<(), String> {
         let mut hosts = headers.get_all(header::HOST).iter();
         let (host, another) = (hosts.next(), hosts.next());
@@ -35,7 +35,7 @@ impl Guard {
             return Ok(());
         }
         let host = host.map_or("", |h| h.to_str().unwrap_or("?"));
-        // A target with a host of its own stands above the header.
+        // The host of the target overrides the header.
         let target = uri.authority().map(|a| a.as_str());
         for host in [Some(host), target].into_iter().flatten() {
             if !is_loopback(host) {
@@ -45,7 +45,7 @@ impl Guard {
         Ok(())
     }
 
-    /// Whether the token was shown, or none is asked for.
+    /// Whether the request has the token, or none is required.
     pub(super) fn knows(&self, headers: &HeaderMap) -> bool {
         let Some(token) = &self.token else {
             return true;
@@ -63,7 +63,7 @@ impl Guard {
         bearer.chain(cookies).any(|shown| token.is(shown.trim()))
     }
 
-    /// The cookie that stands for the token from now on, if it is the right one.
+    /// The cookie that replaces the token from now on, if it is the right one.
     pub(super) fn cookie(&self, shown: &str) -> Option<HeaderValue> {
         self.token.as_ref().filter(|token| token.is(shown))?;
         let cookie = format!("{COOKIE}={shown}; Path=/; HttpOnly; SameSite=Strict");
@@ -71,8 +71,8 @@ impl Guard {
     }
 }
 
-/// Refuses what a page of another site asks a browser for: it could read nothing, but have much
-/// computed.
+/// Refuses requests that a page of another site makes a browser send: that page could read nothing,
+/// but make the daemon compute much.
 pub(super) fn check_site(headers: &HeaderMap) -> Result<(), String> {
     let own = ["same-origin", "none"];
     match headers.get(FETCH_SITE).map(HeaderValue::to_str) {

@@ -1,10 +1,10 @@
-//! What HTTP may take of the daemon: threads of its own, a few of lower priority for what takes
-//! time, memory, and so many requests at a time.
+//! Bounds the resources of HTTP: its own threads, of which a few with a lower priority do what
+//! takes time, its memory, and the number of its requests.
 
+use super::connection::PEER_TIME;
 use crate::config::Limits;
+use crate::daemon::answer::{busy, panic_text, panicked};
 use crate::daemon::memory::{Budget, Reservation};
-use crate::daemon::panic_text;
-use crate::daemon::requests::{busy, panic_error};
 use crate::ipc::wire;
 use bytes::Bytes;
 use std::sync::Arc;
@@ -13,16 +13,16 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, SemaphorePermit};
 
 /// Threads that wait for connections: they compute nothing whose size a request chooses.
 const N_THREADS: usize = 2;
-/// Threads at a time that turn requests into what is asked, and replies into answers.
+/// Threads at a time that decode requests and encode replies.
 const N_WORKING: usize = 2;
-/// Those, and one that reads metrics.
+/// The same, and one thread that reads metrics.
 const N_BLOCKING: usize = N_WORKING + 1;
-/// The priority of those that wait, before the workers, and of those that work, beside them: a page
-/// waits rather than a client of the sockets.
+/// The niceness of the threads that wait, above the workers, and of those that work, equal to them,
+/// so that a page waits rather than a client of the sockets.
 const WAITING_NICENESS: i32 = 1;
 const WORKING_NICENESS: i32 = 5;
-/// Requests of viewers in hand, and of those for which the daemon is asked at a time: both kinds
-/// together fewer than there are connections, so that some can always make way.
+/// Requests of viewers in flight, and those of them that the daemon works on at a time. Both kinds
+/// together are fewer than the connections, so that some connection can always be closed.
 const READS: (usize, usize) = (48, 8);
 const CHANGES: (usize, usize) = (16, 4);
 
@@ -38,59 +38,59 @@ pub(super) fn runtime() -> std::io::Result<Runtime> {
         .build()
 }
 
-/// Something with the memory that is set aside for it.
-pub(super) struct Kept<T> {
-    pub(super) it: T,
+/// A value with the memory that is reserved for it.
+pub(super) struct Reserved<T> {
+    pub(super) value: T,
     pub(super) memory: Reservation,
 }
 
-impl AsRef<[u8]> for Kept<Bytes> {
+impl AsRef<[u8]> for Reserved<Bytes> {
     fn as_ref(&self) -> &[u8] {
-        &self.it
+        &self.value
     }
 }
 
-impl Kept<Bytes> {
+impl Reserved<Bytes> {
     /// Bytes that give their memory back when the last of them is sent.
     pub(super) fn into_bytes(mut self) -> Bytes {
-        self.memory.shrink_to(self.it.len() as u64);
+        self.memory.shrink_to(self.value.len() as u64);
         Bytes::from_owner(self)
     }
 }
 
-/// What all requests share.
+/// The resources that all requests share.
 pub(super) struct Hands {
     memory: Arc<Budget>,
     /// Bytes of the largest answer of the daemon.
     max_answer: u64,
-    reads: Lane,
-    changes: Lane,
+    reads: Queue,
+    changes: Queue,
     working: Arc<Semaphore>,
 }
 
-/// Where requests of one kind wait for their turn.
-struct Lane {
-    in_hand: Semaphore,
+/// The requests of one kind, which wait for their turn.
+struct Queue {
+    in_flight: Semaphore,
     turns: Semaphore,
 }
 
-impl Lane {
-    fn new((in_hand, at_a_time): (usize, usize)) -> Self {
+impl Queue {
+    fn new((in_flight, at_a_time): (usize, usize)) -> Self {
         Self {
-            in_hand: Semaphore::new(in_hand),
+            in_flight: Semaphore::new(in_flight),
             turns: Semaphore::new(at_a_time),
         }
     }
 
     async fn turn(&self) -> Result<Turn<'_>, wire::Error> {
-        let in_hand = self.in_hand.try_acquire();
-        let in_hand = in_hand.map_err(|_| busy("too many requests of viewers wait"))?;
+        let in_flight = self.in_flight.try_acquire();
+        let in_flight = in_flight.map_err(|_| busy("too many requests of viewers wait"))?;
         let turn = self.turns.acquire().await;
-        Ok((in_hand, turn.expect(NEVER_CLOSED)))
+        Ok((in_flight, turn.expect(NEVER_CLOSED)))
     }
 }
 
-/// A request in hand whose turn has come.
+/// The permits of a request whose turn has come.
 pub(super) type Turn<'a> = (SemaphorePermit<'a>, SemaphorePermit<'a>);
 
 impl Hands {
@@ -98,8 +98,8 @@ impl Hands {
         Self {
             memory: Budget::new(limits.http_bytes()),
             max_answer: limits.max_message.0,
-            reads: Lane::new(READS),
-            changes: Lane::new(CHANGES),
+            reads: Queue::new(READS),
+            changes: Queue::new(CHANGES),
             working: Arc::new(Semaphore::new(N_WORKING)),
         }
     }
@@ -114,19 +114,19 @@ impl Hands {
         self.changes.turn().await
     }
 
-    /// Sets memory aside, now or not at all.
+    /// Reserves memory, now or not at all.
     pub(super) fn memory(&self, bytes: u64) -> Option<Reservation> {
         self.memory.try_reserve(bytes)
     }
 
-    /// Sets memory aside for the largest answer there may be; waits a while for it.
+    /// Reserves memory for the largest possible answer, and waits a while for it.
     pub(super) async fn memory_of_answer(&self) -> Result<Reservation, wire::Error> {
         let reserved = self.memory.reserve(self.max_answer);
-        let reserved = tokio::time::timeout(super::PEER_TIME, reserved).await;
+        let reserved = tokio::time::timeout(PEER_TIME, reserved).await;
         reserved.map_err(|_| full())
     }
 
-    /// Does what takes time whose length a request chooses, on one of few threads.
+    /// Does work whose size a request chooses, on one of few threads.
     pub(super) async fn work<T: Send + 'static>(
         &self,
         work: impl FnOnce() -> T + Send + 'static,
@@ -134,7 +134,7 @@ impl Hands {
         let working = Arc::clone(&self.working).acquire_owned().await;
         let working: OwnedSemaphorePermit = working.expect(NEVER_CLOSED);
         beside(move || {
-            // Until it is done, also if nobody waits for it any more.
+            // Until it is done, also if the request has ended.
             let _working = working;
             work()
         })
@@ -142,7 +142,7 @@ impl Hands {
     }
 }
 
-/// Does what takes time on a thread for it. Whoever asks sees to it that few do at a time.
+/// Does work on a thread that may block. The caller sees to it that few do so at a time.
 pub(super) async fn beside<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, wire::Error> {
@@ -151,8 +151,8 @@ pub(super) async fn beside<T: Send + 'static>(
         work()
     });
     done.await.map_err(|e| match e.try_into_panic() {
-        Ok(panic) => panic_error(&panic_text(panic.as_ref())),
-        Err(e) => panic_error(&e.to_string()),
+        Ok(panic) => panicked(&panic_text(panic.as_ref())),
+        Err(e) => panicked(&e.to_string()),
     })
 }
 
@@ -161,7 +161,7 @@ fn give_way(niceness: i32) {
     let _ = rustix::process::setpriority_process(None, niceness);
 }
 
-/// Memory is in use.
+/// The memory of HTTP is in use.
 pub(super) fn full() -> wire::Error {
     let mut error = busy("other requests leave no memory for this one");
     error.set_reason(wire::ErrorReason::MemoryLimit);

@@ -1,17 +1,17 @@
-//! Painted labels: runs of polygons become a label for each.
+//! Expands runs of painted polygons into a label for each polygon.
 
 /// Labels as runs of polygons: first, count, label.
 pub(super) type Run = (usize, usize, i32);
 
-/// A label for each of a shape's polygons; -1 where no run says one, and where several do, the
-/// last. Nothing is laid out before the runs are known to fit, so that it takes no longer than the
-/// shape is large.
+/// A label for each of a shape's polygons: that of the last run that has it, or -1. Nothing is
+/// expanded before the runs are known to fit, so that the work is bounded by the size of the shape.
 pub(super) fn labels_of(n_polygons: usize, runs: &[Run]) -> Result<Vec<i32>, String> {
     let mut total = 0_usize;
     for &(first, count, _) in runs {
         if first.checked_add(count).is_none_or(|end| end > n_polygons) {
             return Err(format!(
-                "a run of {count} polygons begins at polygon {first}, but the shape has {n_polygons}"
+                "a run of {count} polygons begins at polygon {first}, but the shape has \
+                 {n_polygons}"
             ));
         }
         total = total.saturating_add(count);
@@ -42,7 +42,7 @@ mod tests {
 
     #[test]
     fn runs_beyond_the_shape_are_refused_with_what_they_say() {
-        for (runs, said) in [
+        for (runs, expected) in [
             (vec![(5, 2, 0)], "a run of 2 polygons begins at polygon 5"),
             (
                 vec![(0, 1 << 60, 0)],
@@ -57,7 +57,7 @@ mod tests {
         ] {
             let text = labels_of(6, &runs).unwrap_err();
             assert!(
-                text.contains(said) && text.ends_with("the shape has 6"),
+                text.contains(expected) && text.ends_with("the shape has 6"),
                 "{text}"
             );
         }

@@ -22,13 +22,13 @@ pub enum TokenError {
         source: std::io::Error,
     },
     #[error(
-        "the token of the HTTP endpoint, {path}, can be read by others (mode {mode:o}); chmod 600 it, or \
-         remove it and a new one is made"
+        "the token of the HTTP endpoint, {path}, can be read by others (mode {mode:o}); chmod 600 \
+         it, or remove it and a new one is made"
     )]
     Readable { path: String, mode: u32 },
     #[error(
-        "the token of the HTTP endpoint, {path}, has {found} characters, but must be one word of {MIN_CHARS} to \
-         {MAX_CHARS} of A-Z a-z 0-9 . _ ~ -; remove the file and one is made"
+        "the token of the HTTP endpoint, {path}, has {found} characters, but must be one word of \
+         {MIN_CHARS} to {MAX_CHARS} of A-Z a-z 0-9 . _ ~ -; remove the file and one is made"
     )]
     Form { path: String, found: usize },
 }
@@ -83,7 +83,7 @@ impl Token {
     }
 }
 
-/// Where the token is, with a library in this folder.
+/// The path of the token for a library in this folder.
 pub(super) fn path(configured: &Path, library: &Path) -> PathBuf {
     if configured.as_os_str().is_empty() {
         library.join(FILE)
@@ -100,7 +100,7 @@ fn make(path: &Path) -> std::io::Result<String> {
     let mut new = path.as_os_str().to_owned();
     new.push(".new");
     let new = PathBuf::from(new);
-    // What a start that was killed has left.
+    // A start that was killed may have left it.
     let _ = std::fs::remove_file(&new);
     let mut file = std::fs::OpenOptions::new()
         .write(true)

@@ -1,12 +1,11 @@
 //! A worker as the daemon sees it: a process that takes work, and is ended when it holds more
 //! memory than the work may.
 //!
-//! What is bounded is the memory that a worker *holds*, not the address space that it reserves: an
+//! The bound is on the memory that a worker *holds*, not on the address space that it reserves: an
 //! allocator with arenas for many threads, and their stacks, reserve many times what they use. The
-//! daemon looks at it several times a second, from outside, where nothing that the work does can
-//! stop the look.
+//! daemon checks it several times a second, from outside, where the work cannot stop the check.
 
-use super::{OUTCOME, READY, STAGE, WORKER_COMMAND, read_frame};
+use super::pipe::{OUTCOME, READY, STAGE, WORKER_COMMAND, read_frame};
 use serde_json::Value;
 use std::collections::VecDeque;
 use std::io::{self, BufRead as _, BufReader, Write as _};
@@ -16,12 +15,12 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// Between looks at whether the work is still wanted and what its process holds. A process takes at
+/// Between checks whether the work is still wanted and what its process holds. A process takes at
 /// most about 5 GB from the kernel in a second, so it is ended before it holds 250 MB beyond what
 /// it may.
 const LOOK: Duration = Duration::from_millis(50);
-/// Lines of stderr that are kept to say why a worker ended.
-const KEPT_LINES: usize = 4;
+/// Last lines of stderr, which tell why a worker ended.
+const LAST_LINES: usize = 4;
 
 /// Why a worker gave no outcome.
 #[derive(Debug)]
@@ -30,7 +29,7 @@ pub(crate) enum Ended {
     Stopped,
     /// The process died.
     Died {
-        /// What is known of why.
+        /// The cause, as far as it is known.
         text: String,
         /// It held more memory than the work may, or asked for far more.
         out_of_memory: bool,
@@ -50,7 +49,8 @@ pub(super) struct Process {
     child: Child,
     input: ChildStdin,
     frames: mpsc::Receiver<(u8, Vec<u8>)>,
-    said: Arc<Mutex<VecDeque<String>>>,
+    /// The last lines of its stderr, added by the thread that reads them.
+    last_lines: Arc<Mutex<VecDeque<String>>>,
     is_ready: bool,
 }
 
@@ -70,7 +70,7 @@ impl Process {
             .arg0("coseg")
             .arg(WORKER_COMMAND)
             .env("RAYON_NUM_THREADS", threads.to_string())
-            // A backtrace would push what was said before it out of the lines that are kept.
+            // A backtrace would push the lines before it out of the last ones.
             .env("RUST_BACKTRACE", "0")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -81,14 +81,14 @@ impl Process {
             return Err(io::Error::other("a worker without pipes"));
         };
         let (sender, frames) = mpsc::channel();
-        let said = Arc::new(Mutex::new(VecDeque::new()));
-        let lines = Arc::clone(&said);
+        let last_lines = Arc::new(Mutex::new(VecDeque::new()));
+        let lines = Arc::clone(&last_lines);
         // From here on dropping it ends the process.
         let process = Self {
             child,
             input,
             frames,
-            said,
+            last_lines,
             is_ready: false,
         };
         std::thread::Builder::new()
@@ -105,9 +105,9 @@ impl Process {
             .name("worker err".to_owned())
             .spawn(move || {
                 for line in BufReader::new(errors).lines().map_while(Result::ok) {
-                    tracing::debug!(line, "a worker says");
+                    tracing::debug!(line, "stderr of a worker");
                     let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
-                    if lines.len() == KEPT_LINES {
+                    if lines.len() == LAST_LINES {
                         lines.pop_front();
                     }
                     lines.push_back(line);
@@ -116,7 +116,7 @@ impl Process {
         Ok(process)
     }
 
-    /// Waits until it can take work; the error says why it ended.
+    /// Waits until it can take work. The error is why it ended.
     pub(super) fn ready(mut self, within: Duration) -> Result<Self, String> {
         match self.frames.recv_timeout(within) {
             Ok((READY, _)) => {
@@ -127,13 +127,13 @@ impl Process {
         }
     }
 
-    /// Itself, unless it has ended.
-    pub(super) fn still_there(mut self) -> Option<Self> {
+    /// The process, unless it has ended.
+    pub(super) fn still_running(mut self) -> Option<Self> {
         matches!(self.child.try_wait(), Ok(None)).then_some(self)
     }
 
-    /// Sends work that may hold so many bytes of `memory` beyond what is held before, and gives the
-    /// outcome back together with the process, which can take more.
+    /// Sends work that may take so many bytes of `memory`, and returns the outcome with the
+    /// process, which can take more work.
     pub(super) fn run(
         mut self,
         header: &Value,
@@ -147,7 +147,7 @@ impl Process {
         };
         let limit = before + memory;
         if self.send(header, bytes).is_err() {
-            // It cannot have begun with what it has not got.
+            // It cannot have begun the work without having all of it.
             return Err(Fallen::BeforeWork(self.death().0));
         }
         loop {
@@ -161,7 +161,7 @@ impl Process {
             if !wanted() {
                 return Err(Fallen::AtWork(Ended::Stopped));
             }
-            // One that has just ended holds nothing, and its frames end too.
+            // A process that has just ended holds nothing, and its frames end too.
             let now = held(self.child.id()).unwrap_or_default();
             if now > limit {
                 return Err(Fallen::AtWork(outgrown(now, limit)));
@@ -178,7 +178,7 @@ impl Process {
         self.input.flush()
     }
 
-    /// What became of it, now that its output is closed.
+    /// Why it gave no outcome, now that its output is closed.
     fn fallen(mut self) -> Fallen {
         let (text, out_of_memory) = self.death();
         if self.is_ready {
@@ -190,7 +190,7 @@ impl Process {
         Fallen::BeforeWork(text)
     }
 
-    /// What ended it, and whether it asked for too much memory.
+    /// The cause of its end, and whether it wanted too much memory.
     fn death(&mut self) -> (String, bool) {
         // It has closed its output: it is ending, or about to be made to.
         std::thread::sleep(LOOK);
@@ -205,10 +205,13 @@ impl Process {
             },
             Err(e) => e.to_string(),
         };
-        // Whether it was ready may be among what it wrote before.
+        // It may have written that it is ready just before.
         self.is_ready |= self.frames.try_iter().any(|(kind, _)| kind == READY);
-        let said = self.said.lock().unwrap_or_else(PoisonError::into_inner);
-        let last = said
+        let lines = self
+            .last_lines
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        let last = lines
             .iter()
             .map(String::as_str)
             .collect::<Vec<_>>()
@@ -225,7 +228,7 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // It holds nothing that could be lost.
+        // It has nothing that could be lost.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -241,9 +244,8 @@ fn outgrown(held: u64, limit: u64) -> Ended {
     }
 }
 
-/// Bytes of memory that a process holds and that nobody else can have meanwhile, swapped out or
-/// not. Pages of mapped files are not among them: the kernel takes those back when it needs them.
-/// `None`: it has ended.
+/// Bytes of memory that a process holds alone, swapped out or not. Pages of mapped files are not
+/// among them, since the kernel can take those back. `None`: it has ended.
 fn held(pid: u32) -> Option<u64> {
     held_of(&std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?)
 }
@@ -253,7 +255,7 @@ fn held_of(status: &str) -> Option<u64> {
         let value = status.lines().find_map(|l| l.strip_prefix(name))?;
         value.trim().strip_suffix(" kB")?.parse::<u64>().ok()
     };
-    // Where there is no swap the kernel may not count it.
+    // Without swap the kernel may not report it.
     let swapped = kilobytes("VmSwap:").unwrap_or_default();
     Some((kilobytes("RssAnon:")? + kilobytes("RssShmem:")? + swapped) << 10)
 }

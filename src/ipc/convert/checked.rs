@@ -3,7 +3,7 @@
 
 use super::errors::{error, field_error};
 use crate::ipc::wire::{
-    self, ErrorCode, ErrorReason, correct_labels_request::Correction, request::Body, shape_input,
+    self, ErrorCode, ErrorReason, correct_labels_request::Correction, shape_input,
 };
 
 /// Maximum number of landmarks of one map between points.
@@ -11,78 +11,87 @@ pub const MAX_LANDMARKS: usize = 1_000;
 /// Maximum number of shapes of one GetPortraits.
 pub const MAX_PORTRAITS: usize = 256;
 
-/// Rejects a request with this number of raw frames if it is wrong regardless of the library.
-pub fn check_request(body: &Body, n_frames: usize) -> Result<(), wire::Error> {
-    let mut frames = Named::default();
-    match body {
-        Body::CreateCollection(r) => check_spec(r.spec.as_ref(), "spec")?,
-        Body::UpdateCollection(r) => known::<wire::Up>(r.up, "up")?,
-        Body::AddShapes(r) => {
-            check_spec(r.create.as_ref(), "create")?;
-            known::<wire::AddMode>(r.mode, "mode")?;
-            for (i, shape) in r.shapes.iter().enumerate() {
-                match &shape.source {
-                    Some(shape_input::Source::Encoded(mesh)) => {
-                        // The name is built only for an error, since there may be very many shapes.
-                        if wire::MeshFormat::try_from(mesh.format).is_err() {
-                            let field = format!("shapes[{i}].encoded.format");
-                            known::<wire::MeshFormat>(mesh.format, &field)?;
-                        }
-                        frames.file(mesh.bytes.as_ref());
-                    }
-                    Some(shape_input::Source::Arrays(mesh)) => {
-                        frames.array(mesh.vertices.as_ref());
-                        frames.array(mesh.faces.as_ref());
-                    }
-                    Some(shape_input::Source::Path(_)) | None => {}
+/// Checks an addition of shapes.
+pub fn check_addition(
+    r: &wire::AddShapesRequest,
+    frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    check_spec(r.create.as_ref(), "create")?;
+    known::<wire::AddMode>(r.mode, "mode")?;
+    for (i, shape) in r.shapes.iter().enumerate() {
+        match &shape.source {
+            Some(shape_input::Source::Encoded(mesh)) => {
+                // Spelt out only where it is needed: there may be very many shapes.
+                if wire::MeshFormat::try_from(mesh.format).is_err() {
+                    let field = format!("shapes[{i}].encoded.format");
+                    known::<wire::MeshFormat>(mesh.format, &field)?;
                 }
+                frames.file(mesh.bytes.as_ref());
             }
+            Some(shape_input::Source::Arrays(mesh)) => {
+                frames.array(mesh.vertices.as_ref());
+                frames.array(mesh.faces.as_ref());
+            }
+            Some(shape_input::Source::Path(_)) | None => {}
         }
-        Body::CorrectLabels(r) => match &r.correction {
-            Some(Correction::Labels(labels)) => frames.array(Some(labels)),
-            Some(Correction::Faces(faces)) => frames.array(faces.faces.as_ref()),
-            Some(Correction::Part(_)) | None => {}
-        },
-        Body::GetFunctionalMap(r) => check_points(r.points.as_ref())?,
-        Body::TransferFunction(r) => {
-            check_points(r.points.as_ref())?;
-            frames.array(r.values.as_ref());
-        }
-        Body::GetPortraits(r) => {
-            known::<wire::PortraitDetail>(r.detail, "detail")?;
-            at_most("shapes", r.shapes.len(), MAX_PORTRAITS)?;
-        }
-        Body::Hello(_)
-        | Body::Stats(_)
-        | Body::Drain(_)
-        | Body::ListCollections(_)
-        | Body::DescribeCollection(_)
-        | Body::DeleteCollection(_)
-        | Body::NameLabel(_)
-        | Body::GetJob(_)
-        | Body::WatchJob(_)
-        | Body::CancelJob(_)
-        | Body::WaitIdle(_)
-        | Body::ListJobs(_)
-        | Body::RetryJob(_)
-        | Body::ListShapes(_)
-        | Body::GetShape(_)
-        | Body::GetLabels(_)
-        | Body::GetOriginal(_)
-        | Body::RemoveShape(_)
-        | Body::LabelsSnapshot(_)
-        | Body::GetSpectrum(_)
-        | Body::GetHks(_)
-        | Body::GetDescriptors(_)
-        | Body::GetPartCorrespondence(_)
-        | Body::Nearest(_)
-        | Body::EventsSince(_)
-        | Body::MergeLabels(_)
-        | Body::SplitLabel(_)
-        | Body::Undo(_)
-        | Body::SuggestNext(_) => {}
     }
-    frames.check(n_frames)
+    Ok(())
+}
+
+/// Checks the creation of a collection.
+pub fn check_creation(
+    r: &wire::CreateCollectionRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    check_spec(r.spec.as_ref(), "spec")
+}
+
+/// Checks a change of a collection's settings.
+pub fn check_update(
+    r: &wire::UpdateCollectionRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::Up>(r.up, "up")
+}
+
+/// Checks a correction of labels.
+pub fn check_correction(
+    r: &wire::CorrectLabelsRequest,
+    frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    match &r.correction {
+        Some(Correction::Labels(labels)) => frames.array(Some(labels)),
+        Some(Correction::Faces(faces)) => frames.array(faces.faces.as_ref()),
+        Some(Correction::Part(_)) | None => {}
+    }
+    Ok(())
+}
+
+/// Checks a request for a map.
+pub fn check_map(
+    r: &wire::GetFunctionalMapRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    check_points(r.points.as_ref())
+}
+
+/// Checks a transfer of values.
+pub fn check_transfer(
+    r: &wire::TransferFunctionRequest,
+    frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    check_points(r.points.as_ref())?;
+    frames.array(r.values.as_ref());
+    Ok(())
+}
+
+/// Checks a request for portraits.
+pub fn check_portraits(
+    r: &wire::GetPortraitsRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::PortraitDetail>(r.detail, "detail")?;
+    at_most("shapes", r.shapes.len(), MAX_PORTRAITS)
 }
 
 /// Rejects an enum value that this version does not know.
@@ -113,12 +122,12 @@ fn check_points(points: Option<&wire::PointMapOptions>) -> Result<(), wire::Erro
     at_most("points.landmarks", points.landmarks.len(), MAX_LANDMARKS)
 }
 
-/// Frames that fields name. A named frame that was not sent is rejected when it is read, with the
-/// field.
+/// The raw frames that fields of a request name. A frame that is named and missing is refused where
+/// it is read, with the field.
 #[derive(Default)]
-struct Named(Vec<u32>);
+pub struct NamedFrames(Vec<u32>);
 
-impl Named {
+impl NamedFrames {
     fn array(&mut self, array: Option<&wire::ArrayRef>) {
         self.0.extend(array.map(|a| a.frame));
     }
@@ -127,7 +136,11 @@ impl Named {
         self.0.extend(file.map(|f| f.frame));
     }
 
-    fn check(&self, n_frames: usize) -> Result<(), wire::Error> {
+    /// Refuses a message with a raw frame that no field names.
+    ///
+    /// # Errors
+    /// The first such frame.
+    pub fn check(&self, n_frames: usize) -> Result<(), wire::Error> {
         let mut is_named = vec![false; n_frames];
         for &frame in &self.0 {
             if let Some(named) = is_named.get_mut(frame as usize) {
@@ -149,8 +162,18 @@ impl Named {
 
 #[cfg(test)]
 mod tests {
-    use super::check_request;
-    use crate::ipc::wire::{self, ErrorReason, error::Subject, request::Body, shape_input::Source};
+    use super::{
+        NamedFrames, check_addition, check_creation, check_map, check_portraits, check_transfer,
+    };
+    use crate::ipc::wire::{self, ErrorReason, error::Subject, shape_input::Source};
+
+    type Check<R> = fn(&R, &mut NamedFrames) -> Result<(), wire::Error>;
+
+    fn checked<R>(check: Check<R>, request: &R, n_frames: usize) -> Result<(), wire::Error> {
+        let mut frames = NamedFrames::default();
+        check(request, &mut frames)?;
+        frames.check(n_frames)
+    }
 
     fn adding(sources: Vec<Source>) -> wire::AddShapesRequest {
         let shape = |source| wire::ShapeInput {
@@ -182,23 +205,22 @@ mod tests {
             vertices: array(1),
             faces: array(2),
         });
-        let body = Body::AddShapes(adding(vec![file(0), mesh, file(0)]));
-        assert_eq!(check_request(&body, 3), Ok(()));
-        let e = check_request(&body, 4).unwrap_err();
+        let add = adding(vec![file(0), mesh, file(0)]);
+        assert_eq!(checked(check_addition, &add, 3), Ok(()));
+        let e = checked(check_addition, &add, 4).unwrap_err();
         assert_eq!(e.reason(), ErrorReason::FrameMissing);
         assert_eq!(
             e.message,
             "the message has 4 raw frames, but no field names frame 3"
         );
-        let hello = Body::Hello(wire::HelloRequest {});
-        assert_eq!(check_request(&hello, 0), Ok(()));
-        assert!(check_request(&hello, 1).is_err());
-        let values = Body::TransferFunction(wire::TransferFunctionRequest {
+        assert_eq!(NamedFrames::default().check(0), Ok(()));
+        assert!(NamedFrames::default().check(1).is_err());
+        let values = wire::TransferFunctionRequest {
             values: array(0),
             ..Default::default()
-        });
-        assert_eq!(check_request(&values, 1), Ok(()));
-        assert!(check_request(&values, 2).is_err());
+        };
+        assert_eq!(checked(check_transfer, &values, 1), Ok(()));
+        assert!(checked(check_transfer, &values, 2).is_err());
     }
 
     #[test]
@@ -210,17 +232,21 @@ mod tests {
                 ..Default::default()
             })
         };
-        let create = |spec| Body::CreateCollection(wire::CreateCollectionRequest { spec });
+        let create = |spec| {
+            let request = wire::CreateCollectionRequest { spec };
+            checked(check_creation, &request, 0)
+        };
         let add = |create, mode, format| {
             let mesh = wire::EncodedMesh {
                 format,
                 bytes: None,
             };
-            Body::AddShapes(wire::AddShapesRequest {
+            let request = wire::AddShapesRequest {
                 create,
                 mode,
                 ..adding(vec![Source::Encoded(mesh)])
-            })
+            };
+            checked(check_addition, &request, 0)
         };
         let points = |orientation, n| wire::PointMapOptions {
             orientation,
@@ -228,34 +254,37 @@ mod tests {
             ..Default::default()
         };
         let map = |points| {
-            Body::GetFunctionalMap(wire::GetFunctionalMapRequest {
+            let request = wire::GetFunctionalMapRequest {
                 points: Some(points),
                 ..Default::default()
-            })
+            };
+            checked(check_map, &request, 0)
         };
         let transfer = |points| {
-            Body::TransferFunction(wire::TransferFunctionRequest {
+            let request = wire::TransferFunctionRequest {
                 points: Some(points),
                 ..Default::default()
-            })
+            };
+            checked(check_transfer, &request, 0)
         };
         let portraits = |detail, n| {
-            Body::GetPortraits(wire::GetPortraitsRequest {
+            let request = wire::GetPortraitsRequest {
                 detail,
                 shapes: vec![String::new(); n],
                 ..Default::default()
-            })
+            };
+            checked(check_portraits, &request, 0)
         };
-        for body in [
+        for done in [
             create(spec(8, 3)),
             add(spec(1, 1), 2, 5),
             map(points(2, 1_000)),
             transfer(points(0, 0)),
             portraits(3, 256),
         ] {
-            assert_eq!(check_request(&body, 0), Ok(()), "{body:?}");
+            assert_eq!(done, Ok(()));
         }
-        for (body, field) in [
+        for (done, field) in [
             (create(spec(99, 0)), "spec.up"),
             (create(spec(0, -1)), "spec.operator"),
             (add(spec(99, 0), 0, 1), "create.up"),
@@ -268,8 +297,8 @@ mod tests {
             (portraits(4, 0), "detail"),
             (portraits(0, 257), "shapes"),
         ] {
-            let e = check_request(&body, 0).unwrap_err();
-            assert_eq!(e.reason(), ErrorReason::FieldRange, "{body:?}");
+            let e = done.unwrap_err();
+            assert_eq!(e.reason(), ErrorReason::FieldRange, "{field}");
             assert_eq!(e.subject, Some(Subject::Field(field.to_owned())));
         }
     }

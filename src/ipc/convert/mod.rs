@@ -13,7 +13,10 @@ pub use analysis::{
     agreement, descriptors, from_vertices, functional_map, hks, nearest, part_correspondence,
     point_maps, point_request, polygon_values, spectrum, transferred,
 };
-pub use checked::{MAX_LANDMARKS, MAX_PORTRAITS, check_request};
+pub use checked::{
+    MAX_LANDMARKS, MAX_PORTRAITS, NamedFrames, check_addition, check_correction, check_creation,
+    check_map, check_portraits, check_transfer, check_update,
+};
 pub use collections::{
     collection, collection_differs, collection_spec, label_info, new_up, parse_up, up_from_wire,
     up_name, updated,

@@ -194,7 +194,7 @@ fn first_names(tokens: &[String], at: usize) -> Vec<&str> {
 }
 
 /// Names, numbers, `::` and other single characters, without comments and strings.
-fn tokens(text: &str) -> Vec<String> {
+pub(super) fn tokens(text: &str) -> Vec<String> {
     let chars: Vec<char> = text.chars().collect();
     let is_word = |c: char| c.is_alphanumeric() || c == '_';
     let at = |i: usize| chars.get(i).copied().unwrap_or('\0');
