@@ -2,7 +2,7 @@
 //! maps and from what was learnt, which stays as it is until the next correction. Each shape ends with a commit.
 
 use super::commit::{collection_row, map_row, put_relabelled};
-use super::correct::pin_polygons;
+use super::correct::{pin_polygons, pinned_faces};
 use super::lane::Lane;
 use super::learnt::Learnt;
 use super::place::{Known, MAX_MAPS, Plan, next_recluster, sources_of};
@@ -12,7 +12,7 @@ use super::{LabelId, Library, Result, Source};
 use crate::fmap::{Confidence, FunctionalMap, MapOptions};
 use crate::labels::LabelModel;
 use crate::pipeline::{
-    DescriptionView, Labelling, Prepared, TeachOptions, Vote, label_taught, map, proxy_pins,
+    DescriptionView, Labelling, Prepared, TeachOptions, Vote, label_taught, map,
 };
 use crate::store::{MapRow, ShapeId};
 use rayon::prelude::*;
@@ -289,12 +289,7 @@ pub(super) fn pinned_classes(
     if pins.is_empty() {
         return Vec::new();
     }
-    let class = |pin: &i32| {
-        let found = labels.iter().position(|l| i64::from(*l) == i64::from(*pin));
-        found.map(|c| c as u32)
-    };
-    let classes: Vec<Option<u32>> = pins.iter().map(class).collect();
-    proxy_pins(view, &classes, labels.len())
+    pinned_faces(view, pins, labels)
 }
 
 /// Probabilities `(m, k)` that say what is pinned, and nothing elsewhere.

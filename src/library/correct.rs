@@ -15,7 +15,7 @@ use crate::pipeline::{DescriptionView, proxy_pins};
 use crate::segmentation::Surface;
 use crate::store::{Digest, LabelRow, LabelSummary, LabelVersionRow, Tx};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 
 /// Largest label id that a person can choose.
 pub const MAX_LABEL: u32 = 65_535;
@@ -378,12 +378,10 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
         .collect::<BTreeSet<_>>()
         .into_iter()
         .collect();
-    let class = |pin: &i32| labels.binary_search(pin).ok().map(|c| c as u32);
-    let classes: Vec<Option<u32>> = pins.iter().map(class).collect();
     for (label, pin) in row
         .proxy_labels
         .iter_mut()
-        .zip(proxy_pins(view, &classes, labels.len()))
+        .zip(pinned_faces(view, pins, &labels))
     {
         if let Some(class) = pin {
             *label = labels[class as usize];
@@ -410,6 +408,47 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
     NewLabels { row, summary }
 }
 
+/// Class of each proxy face `(m,)` that a person labelled, given the pins `(n_polygons,)` and the label
+/// of each class. If the whole shape is labelled, every proxy face is: one that stands for no polygon
+/// takes the class of the nearest face that does, so that no face keeps a label that nobody gave.
+pub(super) fn pinned_faces<L: Copy + Into<i64>>(
+    view: &DescriptionView<'_>,
+    pins: &[i32],
+    labels: &[L],
+) -> Vec<Option<u32>> {
+    let class = |pin: &i32| {
+        let found = labels.iter().position(|l| (*l).into() == i64::from(*pin));
+        found.map(|c| c as u32)
+    };
+    let of_polygon: Vec<Option<u32>> = pins.iter().map(class).collect();
+    let mut classes = proxy_pins(view, &of_polygon, labels.len());
+    if pins.iter().all(|p| *p >= 0) && classes.iter().any(Option::is_none) {
+        spread(&Surface::new(&view.mesh()), &mut classes);
+    }
+    classes
+}
+
+/// Gives each face without a class that of the nearest face with one, counted in steps over edges and
+/// bridges; of faces equally near, that of the one that was reached first, by ascending index.
+fn spread(surface: &Surface, classes: &mut [Option<u32>]) {
+    let mut neighbours = vec![Vec::new(); classes.len()];
+    for edge in &surface.edges {
+        let [a, b] = edge.faces;
+        neighbours[a as usize].push(b);
+        neighbours[b as usize].push(a);
+    }
+    let with_class = (0..classes.len() as u32).filter(|f| classes[*f as usize].is_some());
+    let mut reached: VecDeque<u32> = with_class.collect();
+    while let Some(face) = reached.pop_front() {
+        for next in &neighbours[face as usize] {
+            if classes[*next as usize].is_none() {
+                classes[*next as usize] = classes[face as usize];
+                reached.push_back(*next);
+            }
+        }
+    }
+}
+
 /// Puts the labels that a person gave in the place of those that were found.
 pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
     let slots = row
@@ -420,6 +459,38 @@ pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
         if *pin >= 0 {
             *label = *pin;
             *confidence = u8::MAX;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::spread;
+    use crate::mesh::icosphere;
+    use crate::segmentation::Surface;
+
+    #[test]
+    fn faces_without_a_class_take_that_of_the_nearest_face() {
+        let surface = Surface::new(&icosphere(2));
+        let mut classes = vec![None; surface.n_faces()];
+        spread(&surface, &mut classes);
+        assert!(classes.iter().all(Option::is_none), "nothing to spread");
+        // Two opposite faces: each takes the half that it is in, up to the size of a face.
+        let far = |a: usize, b: usize| -> f64 {
+            let (a, b) = (surface.centroids[a], surface.centroids[b]);
+            (0..3).map(|i| (a[i] - b[i]).powi(2)).sum()
+        };
+        let opposite = (0..classes.len()).max_by(|a, b| far(0, *a).total_cmp(&far(0, *b)));
+        let opposite = opposite.unwrap();
+        (classes[0], classes[opposite]) = (Some(4), Some(7));
+        spread(&surface, &mut classes);
+        for (f, class) in classes.iter().enumerate() {
+            let (here, there) = (far(0, f).sqrt(), far(opposite, f).sqrt());
+            match class {
+                Some(4) => assert!(here < there + 0.3, "{here} {there}"),
+                Some(7) => assert!(there < here + 0.3, "{here} {there}"),
+                other => panic!("face {f} has {other:?}"),
+            }
         }
     }
 }

@@ -3,7 +3,7 @@
 use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
 use coseg::Library;
 use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, RequestKey, Up};
-use coseg::synth::{Family, Labelled, family};
+use coseg::synth::{Family, Labelled, Options, family};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Known parts as labels that no discovery would number so.
@@ -313,6 +313,31 @@ fn a_part_is_corrected_as_a_whole() {
         .filter(|l| **l == 40)
         .count();
     assert!(there as u64 >= done.n_faces);
+}
+
+/// A coarse mesh has a finer proxy, most of whose faces stand for no polygon of the file.
+#[test]
+fn a_wholly_labelled_coarse_shape_keeps_no_label_that_nobody_gave() {
+    let coarse = Options {
+        n_faces: 300,
+        ..SMALL
+    };
+    let shapes = family(Family::Pliers, 33, 4, &coarse);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let name = &shapes[0].name;
+    let (description, ..) = library.labelled_proxy(COLLECTION, name).unwrap();
+    let view = description.view();
+    assert!(view.faces.len() > 2 * view.face_map.len(), "it is coarse");
+    correct(&library, &shapes[0]);
+    for when in ["at once", "after it was propagated"] {
+        let (_, labels, _) = library.labelled_proxy(COLLECTION, name).unwrap();
+        let used: BTreeSet<i32> = labels.iter().copied().collect();
+        assert_eq!(used, (10..13).collect(), "{when}");
+        let n_parts = library.shape(COLLECTION, name).unwrap().parts.len();
+        assert!(n_parts <= 8, "{n_parts} parts {when}");
+        carry(&library);
+    }
 }
 
 #[test]
