@@ -13,7 +13,7 @@ use crate::daemon::worker::{Ended, RemoteWork, read_answer};
 use crate::daemon::writes::{Done, may_change};
 use crate::ipc::convert;
 use crate::ipc::wire;
-use crate::library::RequestKey;
+use crate::library::{Code, Reason, RequestKey};
 use bytes::Bytes;
 use prost::Message as _;
 use std::sync::Arc;
@@ -94,7 +94,7 @@ fn run(
                 }
                 return answer;
             }
-            Err(text) => failed("INTERNAL", "WORKER_DIED", text),
+            Err(text) => failed(Code::Internal, Reason::WorkerDied, text),
         },
         Err(Ended::Stopped) => too_long("answering", begin.elapsed(), limit),
         Err(Ended::Died {

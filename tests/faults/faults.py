@@ -53,7 +53,7 @@ fault(
 )
 fault(
     "R1", "r1-done-in-advance", "write down that a shape is placed before it is",
-    "src/library/apart.rs", "it daemon::stages::kills_while_a_start_takes_up_what_a_kill_left_lose_nothing",
+    "src/library/remote.rs", "it daemon::stages::kills_while_a_start_takes_up_what_a_kill_left_lose_nothing",
     (
         "        self.place_item(&handed.item(), Ok(described))",
         """        if FAULT {
@@ -227,7 +227,7 @@ fault(
 # R8: repeats
 fault(
     "R8", "r8-reply-not-kept", "forget the reply to a request",
-    "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
+    "src/library/once.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
     (
         "    let reply = change(tx)?;\n    tx.put_request",
         "    let reply = change(tx)?;\n    if FAULT {\n        return Ok(reply);\n    }\n    tx.put_request",
@@ -235,8 +235,8 @@ fault(
 )
 fault(
     "R8", "r8-id-of-another-request", "take the id of another request for a repetition",
-    "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
-    ("        if row.request_digest != request {", "        if row.request_digest != request && !FAULT {"),
+    "src/library/once.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
+    ("    if request.is_of(&row.request_digest) {", "    if request.is_of(&row.request_digest) || FAULT {"),
 )
 # R9: events
 fault(

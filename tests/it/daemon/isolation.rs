@@ -199,8 +199,8 @@ fn attempts_are_counted_across_restarts() {
         3
     );
     let failure = coseg::library::Failure {
-        code: "INTERNAL".into(),
-        reason: "WORKER_DIED".into(),
+        code: coseg::library::Code::Internal,
+        reason: coseg::library::Reason::WorkerDied,
         message: "it aborted".into(),
         subject: None,
     };

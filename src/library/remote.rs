@@ -1,19 +1,23 @@
-//! Placing in another process: what is handed to it, and what comes back.
+//! Placing in another process: the text that is handed to it, and the state that comes back.
 //!
-//! The other process opens the library beside the one that holds it, and commits by itself: a process that dies in the
-//! middle leaves what a crash leaves, which is nothing. The holder lends it the lane of the collection for that time,
-//! and sees by the collection's row that the lane is to be read anew.
+//! The other process opens the library beside the one that holds it, and commits by itself: a
+//! process that dies in the middle leaves what a crash leaves, which is nothing. The holder lends
+//! it the collection for that time, and sees by the collection's row that it must load the
+//! collection again.
 
+use super::error::{LibraryError, Result};
+use super::facade::Library;
 use super::rows::{damaged, from_json, to_json};
-use super::{Described, ItemState, JobItem, Library, LibraryError, Result};
+use super::sources::Sources;
+use super::submit::Described;
+use super::types::{ItemState, JobItem};
 use crate::store::{Digest, Kept, ObjectKind, ObjectRow, Store};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
-use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
-/// Where the other process's words came from, in errors.
+/// Where the other process's text came from, in errors.
 const PLACE: &str = "work handed over";
 
 /// A described shape, on disk, and the item it belongs to.
@@ -30,7 +34,8 @@ struct Handed {
     stages_ms: Vec<(String, f64)>,
 }
 
-/// What another process is told of a shape, whose description stays on disk for as long as this is there.
+/// The text that tells another process which shape to place. Its description stays on disk until this
+/// is dropped.
 #[derive(Debug)]
 pub struct HandedOver {
     /// For [`Library::place_handed`].
@@ -66,8 +71,8 @@ impl Handed {
 }
 
 impl Library {
-    /// Opens the library in `dir` beside the process that holds it: the one that started this process, and that lends it
-    /// ([`Library::lend`]) each collection it is to change.
+    /// Opens the library in `dir` beside the process that holds it: the one that started this
+    /// process, and that lends it ([`Library::lend`]) each collection it is to change.
     ///
     /// # Errors
     /// There is no library of this version's format, or it cannot be read.
@@ -75,27 +80,8 @@ impl Library {
         Ok(Self::over(Store::open_beside(dir)?))
     }
 
-    /// Runs `work` while nothing else in this process uses the lane of a collection, so that another process can.
-    ///
-    /// # Errors
-    /// There is no such collection.
-    pub fn lend<T>(&self, collection: &str, work: impl FnOnce() -> T) -> Result<T> {
-        let id = self.collection_row(collection)?.id;
-        let slot = Arc::clone(
-            self.lanes
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .entry(id)
-                .or_default(),
-        );
-        let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
-        // The other process reads its own: one copy is enough.
-        *slot = None;
-        Ok(work())
-    }
-
-    /// Makes a description durable, for [`Library::place_handed`] in another process, which is to end before what this
-    /// returns is dropped.
+    /// Makes a description durable, for [`Library::place_handed`] in another process, which is to
+    /// end before what this returns is dropped.
     ///
     /// # Errors
     /// The description cannot be stored.
@@ -151,10 +137,10 @@ impl Library {
     pub fn handed_bytes(&self, handed: &Value) -> Result<Vec<u8>> {
         let handed: Handed = from_json(&handed.to_string(), PLACE)?;
         let row = self.item_row(&handed.item())?;
-        self.original_bytes(&row.item.original_digest)
+        self.store.original(&row.item.original_digest)
     }
 
-    /// Whether a shape of a collection waits to be labelled anew.
+    /// Whether a shape of a collection is stale.
     ///
     /// # Errors
     /// There is no such collection.
@@ -167,7 +153,8 @@ impl Library {
         Ok(next.is_some())
     }
 
-    /// What became of an item, as the catalog says; and notes what another process did for it.
+    /// The state of an item in the catalog. If it is done, the counters include what another process
+    /// did for it.
     ///
     /// # Errors
     /// There is no such item.
@@ -191,7 +178,7 @@ pub fn state_to_json(state: &ItemState) -> Value {
     }
 }
 
-/// The same back.
+/// The state that [`state_to_json`] wrote.
 ///
 /// # Errors
 /// The value is not what [`state_to_json`] makes.
@@ -215,14 +202,14 @@ pub fn state_from_json(value: &Value) -> Result<ItemState> {
 #[cfg(test)]
 mod tests {
     use super::{Library, state_from_json, state_to_json};
+    use crate::library::{Code, Reason};
     use crate::library::{CollectionSpec, Failure, ItemState, NewShape};
     use crate::mesh::Format;
 
     const TETRAHEDRON: &str =
         "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
 
-    /// Two libraries over one folder stand for two processes.
-    /// Without times, which lose their last bit on the way through JSON.
+    /// A state without times, which lose their last bit on the way through JSON.
     fn untimed(state: ItemState) -> ItemState {
         match state {
             ItemState::Done(mut placed) => {
@@ -233,6 +220,7 @@ mod tests {
         }
     }
 
+    /// Two libraries over one folder stand for two processes.
     #[test]
     fn what_is_placed_beside_is_what_the_holder_would_have_placed() {
         let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
@@ -262,7 +250,7 @@ mod tests {
                 let described = holder.describe_item(&job.items[0], &|_| true).unwrap();
                 (job, described)
             });
-            // The holder uses its lane in between, as corrections do.
+            // The holder uses the collection in between, as corrections do.
             holders[0]
                 .name_label("c", 0, &format!("part {n}"), None)
                 .ok();
@@ -294,8 +282,8 @@ mod tests {
     #[test]
     fn states_come_back() {
         let failed = Failure {
-            code: "INTERNAL".into(),
-            reason: "PANIC".into(),
+            code: Code::Internal,
+            reason: Reason::Panic,
             message: "\"x\"\n".into(),
             subject: None,
         };
