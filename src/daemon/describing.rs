@@ -10,9 +10,8 @@ use crate::daemon::failures::{cancelled, died_each_time, panicked, too_long};
 use crate::daemon::shared::Daemon;
 use crate::daemon::work::{Outcome, Prepared, Ready, Step};
 use crate::daemon::worker::Ended;
-use crate::ipc::convert;
 use crate::library::isolate::DescribeJob;
-use crate::library::{JobItem, LibraryError};
+use crate::library::{Code, Failure, JobItem, LibraryError};
 use crate::pipeline::Description;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -93,7 +92,7 @@ pub(crate) fn prepare(daemon: &Daemon, item: &JobItem) -> Prepared {
     match daemon.library.needs_description(item) {
         Ok(false) => Prepared::NotNeeded,
         Ok(true) => Prepared::Described(Box::new(describe(daemon, item))),
-        Err(e) => Prepared::Described(Box::new(Err(convert::library_failure(&e)))),
+        Err(e) => Prepared::Described(Box::new(Err(Failure::from(&e)))),
     }
 }
 
@@ -127,8 +126,7 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
                     out_of_memory,
                 }) => (text, out_of_memory),
             };
-            let attempts =
-                note_death(daemon, item, &text).map_err(|e| convert::library_failure(&e))?;
+            let attempts = note_death(daemon, item, &text).map_err(|e| Failure::from(&e))?;
             if attempts >= MAX_ATTEMPTS {
                 return Err(died_each_time(&text, out_of_memory, attempts));
             }
@@ -143,7 +141,7 @@ fn describe(daemon: &Daemon, item: &JobItem) -> Outcome {
     match outcome {
         Ok(Ok(described)) => Ok(described),
         Ok(Err(_)) if daemon.work.progress().is_cancelled(item.job) => Err(cancelled()),
-        Ok(Err(failure)) if failure.code == "CANCELLED" && begin.elapsed() >= limit => {
+        Ok(Err(failure)) if failure.code == Code::Cancelled && begin.elapsed() >= limit => {
             Err(too_long("describing", begin.elapsed(), limit))
         }
         Ok(Err(failure)) => Err(failure),

@@ -1,12 +1,12 @@
 //! Why the work on a shape, or on a request, failed in its worker.
 
-use crate::library::Failure;
+use crate::library::{Code, Failure, Reason};
 use std::time::Duration;
 
-pub(crate) fn failed(code: &str, reason: &str, message: String) -> Failure {
+pub(crate) fn failed(code: Code, reason: Reason, message: String) -> Failure {
     Failure {
-        code: code.to_owned(),
-        reason: reason.to_owned(),
+        code,
+        reason,
         message,
         subject: None,
     }
@@ -14,20 +14,20 @@ pub(crate) fn failed(code: &str, reason: &str, message: String) -> Failure {
 
 pub(crate) fn cancelled() -> Failure {
     let message = "the job was cancelled before this shape was placed".to_owned();
-    failed("CANCELLED", "CANCELLED", message)
+    failed(Code::Cancelled, Reason::Cancelled, message)
 }
 
 pub(crate) fn too_long(doing: &str, took: Duration, limit: Duration) -> Failure {
     let (found, limit) = (took.as_secs_f64(), limit.as_secs());
     let message = format!("{doing} it took {found:.0} s, the limit is {limit} s");
-    failed("DEADLINE_EXCEEDED", "SHAPE_TIMEOUT", message)
+    failed(Code::DeadlineExceeded, Reason::ShapeTimeout, message)
 }
 
 /// The work ended its worker.
 pub(crate) fn died(what: &str, text: &str, out_of_memory: bool) -> Failure {
     let (code, reason) = match out_of_memory {
-        true => ("RESOURCE_EXHAUSTED", "SHAPE_MEMORY"),
-        false => ("INTERNAL", "WORKER_DIED"),
+        true => (Code::ResourceExhausted, Reason::ShapeMemory),
+        false => (Code::Internal, Reason::WorkerDied),
     };
     failed(code, reason, format!("{what}: {text}"))
 }
@@ -44,8 +44,8 @@ pub(crate) fn panicked(text: &str) -> Failure {
         .iter()
         .any(|sign| text.contains(sign));
     let (code, reason) = match out_of_memory {
-        true => ("RESOURCE_EXHAUSTED", "SHAPE_MEMORY"),
-        false => ("INTERNAL", "PANIC"),
+        true => (Code::ResourceExhausted, Reason::ShapeMemory),
+        false => (Code::Internal, Reason::Panic),
     };
     failed(
         code,

@@ -10,8 +10,7 @@ use crate::daemon::failures::{cancelled, died_each_time, failed, panicked, too_l
 use crate::daemon::shared::{Daemon, Notice, blocking};
 use crate::daemon::work::{Outcome, Prepared, Step};
 use crate::daemon::worker::{self, Ended, Placing};
-use crate::ipc::convert;
-use crate::library::{Described, Failure, ItemState, JobItem, LibraryError};
+use crate::library::{Code, Described, Failure, ItemState, JobItem, LibraryError, Reason};
 use crate::store::StoreError;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -21,8 +20,6 @@ use tokio::sync::{mpsc, oneshot};
 /// Delay before a failed write is tried again, doubled each time up to the last.
 const FIRST_RETRY: Duration = Duration::from_secs(1);
 const LAST_RETRY: Duration = Duration::from_secs(30);
-/// The reason with which the library refuses a shape that was cancelled meanwhile.
-const CANCELLED: &str = "CANCELLED";
 
 /// The placement queue of a collection.
 pub(crate) async fn place_in_order(
@@ -85,8 +82,8 @@ async fn described(daemon: &Arc<Daemon>, item: &JobItem, prepared: Prepared) -> 
         Prepared::Described(outcome) => *outcome,
         // The library finds the reason by itself, and ignores this.
         Prepared::NotNeeded => Err(failed(
-            "INTERNAL",
-            "GONE",
+            Code::Internal,
+            Reason::Gone,
             "it was not described".to_owned(),
         )),
     });
@@ -132,7 +129,7 @@ async fn place(daemon: &Arc<Daemon>, item: &JobItem, mut outcome: Outcome) -> bo
                 delay = (delay * 2).min(LAST_RETRY);
                 continue;
             }
-            Ok(Err(e)) => convert::library_failure(&e),
+            Ok(Err(e)) => Failure::from(&e),
             Err(panic) => panicked(&panic),
         };
         if outcome.is_err() {
@@ -166,7 +163,8 @@ fn place_remotely(
         // Recording a failure needs no worker.
         Err(why) => return library.place_item(item, Err(why)),
     };
-    let placed = library.lend(&item.collection, || try_to_place(daemon, item, &described));
+    let placed =
+        library.with_exclusive(&item.collection, || try_to_place(daemon, item, &described));
     match placed {
         Ok(Ok(Ok(()))) => library.item_state(item),
         Ok(Ok(Err(why))) => library.place_item(item, Err(why)),
@@ -185,7 +183,7 @@ fn try_to_place(
     described: &Described,
 ) -> Result<Result<(), Failure>, LibraryError> {
     let library = &daemon.library;
-    let ticket = library.hand_over(item, described)?;
+    let ticket = library.placement_ticket(item, described)?;
     let n_bytes = library.item_bytes(item)?;
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
@@ -195,7 +193,9 @@ fn try_to_place(
         let work = Placing::Place(&ticket.words, n_bytes);
         let (text, out_of_memory) = match daemon.pool.place(&item.collection, work, &wanted) {
             Ok(report) => match outcome(daemon, &report)? {
-                worker::Outcome::Failed(why) if why.reason == CANCELLED => return Ok(Ok(())),
+                worker::Outcome::Failed(why) if why.reason == Reason::Cancelled => {
+                    return Ok(Ok(()));
+                }
                 worker::Outcome::Failed(why) => return Ok(Err(why)),
                 worker::Outcome::State(_) | worker::Outcome::Relabelled(_) => return Ok(Ok(())),
             },
@@ -234,8 +234,8 @@ fn outcome(daemon: &Daemon, report: &serde_json::Value) -> Result<worker::Outcom
             Err(daemon.library.store().health().stop(cause).into())
         }
         Err(text) => Ok(worker::Outcome::Failed(failed(
-            "INTERNAL",
-            "WORKER_DIED",
+            Code::Internal,
+            Reason::WorkerDied,
             text,
         ))),
     }
@@ -265,8 +265,8 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
             tracing::warn!(
                 collection,
                 shape,
-                code = f.code,
-                reason = f.reason,
+                code = %f.code,
+                reason = %f.reason,
                 message = f.message,
                 "failed"
             );
@@ -340,7 +340,8 @@ fn relabel_remotely(
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let wanted = || begin.elapsed() < limit;
     let work = Placing::Relabel(collection);
-    let report = library.lend(collection, || daemon.pool.place(collection, work, &wanted))?;
+    let report =
+        library.with_exclusive(collection, || daemon.pool.place(collection, work, &wanted))?;
     match report {
         Ok(report) => match outcome(daemon, &report)? {
             worker::Outcome::Relabelled(again) => Ok(Ok(again)),

@@ -13,7 +13,7 @@ use crate::daemon::worker::{Ended, RemoteWork, read_answer};
 use crate::daemon::writes::{Done, may_change};
 use crate::ipc::convert;
 use crate::ipc::wire;
-use crate::library::RequestKey;
+use crate::library::{Code, Reason, RequestKey};
 use bytes::Bytes;
 use prost::Message as _;
 use std::sync::Arc;
@@ -48,7 +48,10 @@ pub(crate) fn edit(
         let _permit = runtime.block_on(daemon.capacity.editing.acquire());
         run(daemon, Remote::Edit(edit), frames, key, &|| true)
     };
-    let made = daemon.library.lend(&collection, make).map_err(refused)?;
+    let made = daemon
+        .library
+        .with_exclusive(&collection, make)
+        .map_err(refused)?;
     // Also after a failure: a worker may have ended just after the commit.
     daemon.notice(Notice::Changed(collection.clone()));
     daemon.nudge(&collection);
@@ -94,7 +97,7 @@ fn run(
                 }
                 return answer;
             }
-            Err(text) => failed("INTERNAL", "WORKER_DIED", text),
+            Err(text) => failed(Code::Internal, Reason::WorkerDied, text),
         },
         Err(Ended::Stopped) => too_long("answering", begin.elapsed(), limit),
         Err(Ended::Died {

@@ -1,20 +1,24 @@
-//! Kept maps that do not agree with the others are made anew, by way of the latent functions on which the others agree.
+//! Stored maps that do not agree with the others are recomputed, through the latent functions on which
+//! the others agree.
 
-use super::commit::map_row;
-use super::lane::Lane;
-use super::rows::quality_from_json;
-use super::{Library, MapInfo, Result};
-use crate::fmap::consistency::{Link, Standing};
+use super::change::{Change, commit, map_row};
+use super::collection::Collection;
+use super::error::Result;
+use super::facade::Library;
+use super::rows::{damaged, quality_from_json};
+use super::sources::Sources;
+use super::types::MapInfo;
+use super::voting::PreparedShape;
+use crate::fmap::FunctionalMap;
+use crate::fmap::consistency::{Link, Standing, leading};
 use crate::fmap::latent::LatentBasis;
-use crate::fmap::{FunctionalMap, MapOptions};
-use crate::pipeline::{Prepared, map, map_from};
 use crate::store::agreement::KeptMaps;
-use crate::store::{CollectionRow, ShapeId};
+use crate::store::{CollectionRow, ShapeId, Store};
 
 /// Shapes on which the latent functions are solved for together; the others join one by one.
 const MAX_TOGETHER: usize = 40;
 
-/// A kept map that does not agree with those by way of other shapes.
+/// A stored map that does not agree with the maps through other shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Disagreement {
     /// Functions are carried from this shape
@@ -26,7 +30,7 @@ pub struct Disagreement {
 }
 
 impl Library {
-    /// The kept maps of a collection that do not agree with the others.
+    /// The stored maps of a collection that do not agree with the others.
     ///
     /// # Errors
     /// There is no such collection, or the catalog cannot be read.
@@ -36,18 +40,20 @@ impl Library {
         Ok(disagreements(&kept, &kept.standings()))
     }
 
-    /// Makes the kept maps of a collection anew that do not agree with the others: by way of the latent functions of the
-    /// others, then refined, and from nearest neighbours of descriptors, as at first; the one that fits the others better
-    /// is taken, unless that is the map that is kept. The shapes they lead to are labelled anew. What was done, in words.
+    /// Recomputes the stored maps of a collection that do not agree with the others: through the latent
+    /// functions of the others, then refined, and from nearest neighbours of descriptors, as at first.
+    /// The one that fits the others better is stored, unless the stored map fits better still. The
+    /// shapes they lead to become stale. Returns what was done, in words.
     ///
     /// # Errors
     /// There is no such collection, or it cannot be read or written.
     pub fn mend_maps(&self, collection: &str) -> Result<Vec<String>> {
         let row = self.collection_row(collection)?;
-        self.with_lane(row, |lane| self.mend_in(lane))
+        self.with_collection(row, |collection| self.mend_in(collection))
     }
 
-    /// How a map for parts agrees with the kept ones of its collection; `None` if it is too small to compare.
+    /// How a map for parts agrees with the stored ones of its collection; `None` if it is too small to
+    /// compare.
     ///
     /// # Errors
     /// There is no such collection or shape, or the catalog cannot be read.
@@ -64,84 +70,36 @@ impl Library {
         Ok(kept.standing_of(a.id, b.id, &map.c_12, map.k1))
     }
 
-    /// How many maps to a new shape do not agree with the maps between the shapes they come from. Those are noted in the
-    /// log; their votes count as their confidence says.
-    pub(super) fn n_inconsistent(&self, maps: &[(ShapeId, FunctionalMap)]) -> Result<u32> {
-        let sources = maps.iter().map(|(from, _)| *from).collect();
-        let catalog = self.store.catalog();
-        let kept = catalog.read(|r| -> Result<_> { Ok(KeptMaps::among(r, sources)?) })?;
-        let new: Vec<_> = maps
-            .iter()
-            .map(|(from, map)| (*from, map.c_12.as_slice(), map.k1))
-            .collect();
-        let mut n = 0;
-        for (from, standing) in kept.standings_of_new(&new) {
-            if standing.inconsistent {
-                let Standing {
-                    departure,
-                    n_triangles,
-                    ..
-                } = standing;
-                tracing::info!(%from, departure, n_triangles, "a map to the new shape disagrees");
-                n += 1;
-            }
-        }
-        Ok(n)
-    }
-
     fn kept_maps(&self, row: &CollectionRow) -> Result<KeptMaps> {
         let catalog = self.store.catalog();
         catalog.read(|r| -> Result<_> { Ok(KeptMaps::read(r, row.id)?) })
     }
 
-    fn mend_in(&self, lane: &mut Lane) -> Result<Vec<String>> {
-        let kept = self.kept_maps(&lane.row)?;
-        let standings = kept.standings();
-        let wrong = disagreements(&kept, &standings);
-        let Some(learnt) = lane.learnt.as_ref().filter(|_| !wrong.is_empty()) else {
+    fn mend_in(&self, collection: &mut Collection) -> Result<Vec<String>> {
+        let stored = self.kept_maps(collection.row())?;
+        let standings = stored.standings();
+        let wrong = disagreements(&stored, &standings);
+        let Some(model) = collection.model().filter(|_| !wrong.is_empty()) else {
             return Ok(Vec::new());
         };
-        let model = learnt.base_model();
-        let (latent, place) = self.latent(&kept, &standings)?;
+        let model = model.base_model();
+        let (latent, place) = self.latent(&stored, &standings)?;
         let mut done = Vec::new();
         for d in &wrong {
-            let (from, to) = (self.known(d.from)?, self.known(d.to)?);
+            let (from, to) = (self.store.known(d.from)?, self.store.known(d.to)?);
             let names = format!("{} to {}", from.row.name, to.row.name);
-            let (one, two) = (from.mapped.view(), to.mapped.view());
-            let (a, b) = (Prepared::new(&one, &model), Prepared::new(&two, &model));
-            let (one, two) = ((&one, &a), (&two, &b));
-            let options = MapOptions::default();
-            let mut tries = vec![map(one, two, &options)];
-            let at = |id: ShapeId| kept.shapes.binary_search(&id).ok();
+            let at = |id: ShapeId| stored.shapes.binary_search(&id).ok();
             let (Some(i), Some(j)) = (at(d.from), at(d.to)) else {
                 continue;
             };
+            let shapes = [&from, &to].map(|k| PreparedShape::new(k.view(), &model));
+            let mut tries = vec![shapes[0].map_to(&shapes[1])];
             if let (Some(x), Some(y)) = (place[i], place[j]) {
-                let through = latent.through(x, y);
-                tries.push(map_from(one, two, (&through, kept.k), &options));
+                let start = latent.through(x, y);
+                tries.push(shapes[0].map_grown_from(&shapes[1], (&start, stored.k)));
             }
-            let departure = |c_12: &[f32]| -> f64 {
-                let others = kept.maps.iter().zip(&standings);
-                let mut maps: Vec<(usize, usize, Vec<f32>)> = others
-                    .filter(|((f, t, _), s)| !s.inconsistent && (*f, *t) != (i, j))
-                    .map(|(m, _)| m.clone())
-                    .collect();
-                maps.push((i, j, c_12.to_vec()));
-                let with = KeptMaps {
-                    maps,
-                    ..kept.clone()
-                };
-                with.standings().last().map_or(0.0, |s| s.departure)
-            };
-            let block = |m: &FunctionalMap| {
-                crate::fmap::consistency::leading(&m.c_12, m.k1, kept.k, kept.k)
-            };
-            let best = tries
-                .into_iter()
-                .filter(|m| m.k1 >= kept.k && m.k2 >= kept.k)
-                .map(|m| (departure(&block(&m)), m))
-                .min_by(|x, y| x.0.total_cmp(&y.0));
-            let old = self.store.catalog().read(|r| r.map(d.from, d.to))?;
+            let best = best_fitting(&stored, &standings, (i, j), tries);
+            let old = self.store.map(d.from, d.to)?;
             let Some(((after, new), old)) = best.zip(old) else {
                 continue;
             };
@@ -153,22 +111,23 @@ impl Library {
                 ));
                 continue;
             }
-            self.store.catalog().write(|tx| -> Result<()> {
-                tx.put_map(&map_row(d.from, d.to, &new))?;
-                Ok(tx.set_stale(d.to, true)?)
-            })?;
-            if let Some(shape) = lane.shapes.iter_mut().find(|s| s.id == d.to) {
-                shape.stale = true;
-            }
+            let change = Change {
+                maps: vec![map_row(d.from, d.to, &new)],
+                stale: vec![(d.to, true)],
+                ..Change::default()
+            };
+            commit(&self.store, collection, change, |_, _| Ok(()))?;
             done.push(format!(
-                "map {names}: made anew, departure {before:.2} to {after:.2}, confidence {was:.2} to {:.2}",
+                "map {names}: made anew, departure {before:.2} to {after:.2}, \
+                 confidence {was:.2} to {:.2}",
                 new.quality.confidence
             ));
         }
         Ok(done)
     }
 
-    /// The latent functions on which maps that agree do so, and where each shape is among them, if it is.
+    /// The latent functions on which maps that agree do so, and where each shape is among them, if
+    /// it is.
     fn latent(
         &self,
         kept: &KeptMaps,
@@ -187,8 +146,8 @@ impl Library {
         let mut values = Vec::with_capacity(order.len());
         for (p, &s) in order.iter().enumerate() {
             place[s] = Some(p);
-            let known = self.known(kept.shapes[s])?;
-            values.push(known.mapped.view().eigenvalues[..kept.k].to_vec());
+            let known = self.store.known(kept.shapes[s])?;
+            values.push(known.view().eigenvalues[..kept.k].to_vec());
         }
         let together = order.len().min(MAX_TOGETHER);
         let links: Vec<Link<'_>> = good
@@ -206,7 +165,7 @@ impl Library {
         let first: Vec<Link<'_>> = links.iter().filter(within).copied().collect();
         let slices: Vec<&[f64]> = values.iter().map(Vec::as_slice).collect();
         let solved = LatentBasis::solve(&slices[..together], &first, kept.k);
-        let mut latent = solved.map_err(|e| super::rows::damaged("maps", &e.to_string()))?;
+        let mut latent = solved.map_err(|e| damaged("maps", &e.to_string()))?;
         for (p, values) in slices.iter().enumerate().skip(together) {
             let into: Vec<Link<'_>> = links
                 .iter()
@@ -217,6 +176,59 @@ impl Library {
         }
         Ok((latent, place))
     }
+}
+
+/// Counts the maps to a new shape that do not agree with the maps between the shapes they come from,
+/// and logs them. Their votes count as their confidence says.
+pub(super) fn n_inconsistent(store: &Store, maps: &[(ShapeId, FunctionalMap)]) -> Result<u32> {
+    let sources = maps.iter().map(|(from, _)| *from).collect();
+    let catalog = store.catalog();
+    let kept = catalog.read(|r| -> Result<_> { Ok(KeptMaps::among(r, sources)?) })?;
+    let new: Vec<_> = maps
+        .iter()
+        .map(|(from, map)| (*from, map.c_12.as_slice(), map.k1))
+        .collect();
+    let mut n = 0;
+    for (from, standing) in kept.standings_of_new(&new) {
+        if standing.inconsistent {
+            let Standing {
+                departure,
+                n_triangles,
+                ..
+            } = standing;
+            tracing::info!(%from, departure, n_triangles, "a map to the new shape disagrees");
+            n += 1;
+        }
+    }
+    Ok(n)
+}
+
+/// Of some maps from the shape `i` to the shape `j` the one that departs least from the maps that
+/// agree, and by how much.
+fn best_fitting(
+    stored: &KeptMaps,
+    standings: &[Standing],
+    (i, j): (usize, usize),
+    tries: Vec<FunctionalMap>,
+) -> Option<(f64, FunctionalMap)> {
+    let departure = |map: &FunctionalMap| -> f64 {
+        let others = stored.maps.iter().zip(standings);
+        let mut maps: Vec<(usize, usize, Vec<f32>)> = others
+            .filter(|((f, t, _), s)| !s.inconsistent && (*f, *t) != (i, j))
+            .map(|(m, _)| m.clone())
+            .collect();
+        maps.push((i, j, leading(&map.c_12, map.k1, stored.k, stored.k)));
+        let with = KeptMaps {
+            maps,
+            ..stored.clone()
+        };
+        with.standings().last().map_or(0.0, |s| s.departure)
+    };
+    let comparable = tries.into_iter();
+    let comparable = comparable.filter(|m| m.k1 >= stored.k && m.k2 >= stored.k);
+    comparable
+        .map(|m| (departure(&m), m))
+        .min_by(|x, y| x.0.total_cmp(&y.0))
 }
 
 fn disagreements(kept: &KeptMaps, standings: &[Standing]) -> Vec<Disagreement> {

@@ -1,17 +1,20 @@
-//! Collections: created, described, deleted; their labels named.
+//! Collections are created, described and deleted, and their labels are named.
 
-use super::commit::event;
-use super::history::{Before, from_reply};
+use super::change::{Change, LabelEdit, Undoable, commit_once, event};
+use super::collection::State;
+use super::error::{LibraryError, Named, Result};
+use super::facade::Library;
+use super::lookup::require_collection;
 use super::names::check_name;
-use super::rows::{CollectionState, damaged, operator_from_name, operator_name, to_json};
-use super::{
-    CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, Library, LibraryError,
-    RequestKey, Result, Up, UpEstimate,
+use super::once::{Request, answered, from_reply, once};
+use super::reason::Reason;
+use super::rows::{damaged, operator_from_name, operator_name, to_json};
+use super::sources::Sources;
+use super::types::{
+    CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, RequestKey, Up, UpEstimate,
 };
 use crate::pipeline::Params;
-use crate::store::catalog::KIND_NAME;
-use crate::store::{CollectionRow, Digest, LabelRow, NewCollection, Reader, Tx};
-use std::sync::PoisonError;
+use crate::store::{CollectionId, CollectionRow, LabelRow, NewCollection, Reader, Tx};
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -32,7 +35,7 @@ impl Library {
         check_name("collection", &spec.name, MAX_NAME)?;
         if let Some(n) = spec.n_parts.filter(|n| !(1..=MAX_PARTS).contains(n)) {
             let message = format!("the number of parts is {n}, but must be 1 to {MAX_PARTS}");
-            return Err(LibraryError::invalid("N_PARTS_RANGE", message));
+            return Err(LibraryError::invalid(Reason::NPartsRange, message));
         }
         let working_faces = match spec.working_faces {
             0 => Params::default().working_faces,
@@ -40,14 +43,14 @@ impl Library {
             n => {
                 let (least, most) = (WORKING_FACES.start(), WORKING_FACES.end());
                 let message = format!("working_faces is {n}, but must be {least} to {most}");
-                return Err(LibraryError::invalid("WORKING_FACES_RANGE", message));
+                return Err(LibraryError::invalid(Reason::WorkingFacesRange, message));
             }
         };
-        let request = Digest::of(to_json(&format!("create {spec:?}")).as_bytes());
-        self.once(key, request, |tx| {
+        let request = Request::of(key, &to_json(&format!("create {spec:?}")));
+        let create = |tx: &Tx<'_>| {
             if tx.collection(&spec.name)?.is_some() {
                 return Err(LibraryError::AlreadyExists {
-                    reason: "COLLECTION_EXISTS",
+                    reason: Reason::CollectionExists,
                     message: format!("a collection named {:?} is there already", spec.name),
                 });
             }
@@ -61,7 +64,10 @@ impl Library {
             })?;
             event(tx, id, &EventKind::CollectionCreated)?;
             Ok(Vec::new())
-        })?;
+        };
+        self.store
+            .catalog()
+            .write(|tx| once(tx, &request, create))?;
         self.collection(&spec.name)
     }
 
@@ -89,21 +95,21 @@ impl Library {
     /// # Errors
     /// There is none of the name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
-        let request = Digest::of(format!("delete {name:?}").as_bytes());
+        let request = Request::of(key, &format!("delete {name:?}"));
         // Stays empty where the request is repeated: another collection may have the name by then.
         let deleted = std::cell::Cell::new(None);
         let delete = |tx: &Tx<'_>| {
-            let row = super::read::require_collection(tx, name)?;
+            let row = require_collection(tx, name)?;
             event(tx, row.id, &EventKind::CollectionDeleted)?;
             tx.delete_collection(row.id)?;
             deleted.set(Some(row.id));
             Ok(Vec::new())
         };
-        self.store.freeing(|| self.once(key, request, delete))?;
+        let catalog = self.store.catalog();
+        self.store
+            .freeing(|| catalog.write(|tx| once(tx, &request, delete)))?;
         if let Some(id) = deleted.take() {
-            // Ids are not used again. Who is at its lane still has it, and finds no collection.
-            let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
-            lanes.remove(&id);
+            self.forget_collection(id);
         }
         Ok(())
     }
@@ -121,74 +127,65 @@ impl Library {
     ) -> Result<LabelInfo> {
         check_name("label", name, MAX_LABEL_NAME)?;
         let row = self.collection_row(collection)?;
-        let request = Digest::of(format!("name {collection:?} {label} {name:?}").as_bytes());
-        let reply = self.with_lane(row, |lane| {
-            self.once(key, request, |tx| {
-                let mut known = find_label(tx, lane.row.id, label)?;
-                let labels = tx.labels(lane.row.id)?;
-                let taken = |l: &&LabelRow| {
-                    l.id != label && l.merged_into.is_none() && l.name.as_deref() == Some(name)
-                };
-                if let Some(other) = labels.iter().find(taken) {
-                    return Err(LibraryError::AlreadyExists {
-                        reason: "NAME_TAKEN",
-                        message: format!("label {} is named {name:?} already", other.id),
-                    });
+        let request = Request::of(key, &format!("name {collection:?} {label} {name:?}"));
+        self.with_collection(row, |collection| {
+            let id = collection.id();
+            let reply = match answered(&self.store, &request)? {
+                Some(reply) => reply,
+                None => {
+                    let change = naming(self.store.labels(id)?, label, name)?;
+                    commit_once(&self.store, collection, change, &request, |tx, _| {
+                        Ok(to_json(&label_in(tx, id, label)?).into_bytes())
+                    })?
                 }
-                let before = Before::names(labels);
-                tx.insert_correction(lane.row.id, KIND_NAME, "{}", &before.encode())?;
-                known.name = Some(name.to_string());
-                tx.put_label(lane.row.id, &known)?;
-                event(
-                    tx,
-                    lane.row.id,
-                    &EventKind::LabelNamed {
-                        label,
-                        name: name.into(),
-                    },
-                )?;
-                Ok(to_json(&label_in(tx, lane.row.id, label)?).into_bytes())
-            })
-        })?;
-        if reply.is_empty() {
-            // An earlier version kept no more of its answer than that there was one.
-            return self.label_of(&self.collection_row(collection)?, label);
-        }
-        from_reply(&reply)
+            };
+            if reply.is_empty() {
+                // An earlier version stored only that there was a reply.
+                return self.store.catalog().read(|r| label_in(r, id, label));
+            }
+            from_reply(&reply)
+        })
     }
+}
 
-    /// A label as it stands.
-    pub(super) fn label_of(&self, row: &CollectionRow, label: LabelId) -> Result<LabelInfo> {
-        self.store.catalog().read(|r| label_in(r, row.id, label))
+/// What giving a label a name changes.
+fn naming(labels: Vec<LabelRow>, label: LabelId, name: &str) -> Result<Change> {
+    let row = find_label(&labels, label)?.clone();
+    let taken =
+        |l: &&LabelRow| l.id != label && l.merged_into.is_none() && l.name.as_deref() == Some(name);
+    if let Some(other) = labels.iter().find(taken) {
+        return Err(LibraryError::AlreadyExists {
+            reason: Reason::NameTaken,
+            message: format!("label {} is named {name:?} already", other.id),
+        });
     }
+    Ok(Change {
+        undoable: Some(Undoable::Name),
+        labels: vec![LabelEdit::Named(row, name.to_owned())],
+        ..Change::default()
+    })
 }
 
 /// A label as a reader sees it.
 pub(super) fn label_in(
     reader: &Reader<'_>,
-    collection: crate::store::CollectionId,
+    collection: CollectionId,
     label: LabelId,
 ) -> Result<LabelInfo> {
     let uses = reader.label_uses(collection)?;
     let n_shapes = uses.get(&label).copied().unwrap_or(0);
-    Ok(label_info(find_label(reader, collection, label)?, n_shapes))
+    let labels = reader.labels(collection)?;
+    Ok(label_info(find_label(&labels, label)?.clone(), n_shapes))
 }
 
-/// A label of a collection, in use or not.
-pub(super) fn find_label(
-    reader: &Reader<'_>,
-    collection: crate::store::CollectionId,
-    label: LabelId,
-) -> Result<crate::store::LabelRow> {
-    let found = reader
-        .labels(collection)?
-        .into_iter()
-        .find(|l| l.id == label);
-    found.ok_or_else(|| LibraryError::not_found("label", label.to_string()))
+/// A label among those of a collection, in use or not.
+pub(super) fn find_label(labels: &[LabelRow], label: LabelId) -> Result<&LabelRow> {
+    let found = labels.iter().find(|l| l.id == label);
+    found.ok_or_else(|| LibraryError::not_found(Named::Label, label.to_string()))
 }
 
 /// A label with the number of shapes that carry it.
-pub(super) fn label_info(row: crate::store::LabelRow, n_shapes: u64) -> LabelInfo {
+fn label_info(row: LabelRow, n_shapes: u64) -> LabelInfo {
     LabelInfo {
         id: row.id,
         name: row.name,
@@ -199,10 +196,10 @@ pub(super) fn label_info(row: crate::store::LabelRow, n_shapes: u64) -> LabelInf
 }
 
 fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
-    let place = format!("collections {}", row.name);
+    let location = format!("collections {}", row.name);
     let uses = reader.label_uses(row.id)?;
     let labels = reader.labels(row.id)?.into_iter();
-    let state = CollectionState::of(&row)?;
+    let state = State::of(&row)?;
     Ok(CollectionInfo {
         up_estimate: state.up.map(|up| UpEstimate {
             up: Up::along(up.vote().trusted()),
@@ -227,8 +224,8 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
             .collect(),
         spec: CollectionSpec {
             n_parts: row.n_parts,
-            up: row.up.parse::<Up>().map_err(|e| damaged(&place, &e))?,
-            operator: operator_from_name(&row.operator, &place)?,
+            up: row.up.parse::<Up>().map_err(|e| damaged(&location, &e))?,
+            operator: operator_from_name(&row.operator, &location)?,
             working_faces: row.working_faces,
             name: row.name,
         },

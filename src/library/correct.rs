@@ -1,19 +1,22 @@
-//! A person labels faces of a shape: they are pinned, and everything else follows from them.
+//! A person labels faces of a shape: they are pinned, and the labels of all other faces follow from
+//! them.
 
-use super::commit::{collection_row, event};
-use super::history::{Before, from_reply};
-use super::lane::Lane;
-use super::place::Known;
-use super::relabel::{NewLabels, area_shares, cause, face_ids, moves};
-use super::rows::{CarryingState, CollectionState, Teaching, damaged, label_colour, to_json};
-use super::submit::unix_secs;
-use super::{
-    EventKind, FailureSubject, LabelId, Library, LibraryError, PartInfo, RequestKey, Result,
-};
+use super::change::{Change, LabelEdit, Undoable, commit_once};
+use super::collection::state::{Supervision, Vocabulary};
+use super::collection::{Collection, Staleness, supervised};
+use super::error::{LibraryError, Result};
+use super::facade::Library;
+use super::labelling::{NewLabels, Relabelled, area_shares, cause, face_ids};
+use super::once::{Request, answered, from_reply};
+use super::pins::{Instead, UsedLabels, pin_polygons, pinned_faces, pinned_share, used_labels};
+use super::reason::Reason;
+use super::rows::to_json;
+use super::sources::{Known, Sources};
+use super::types::{EventKind, FailureSubject, LabelId, PartInfo, RequestKey};
 use crate::correspondence::parts;
-use crate::pipeline::{DescriptionView, proxy_pins};
+use crate::pipeline::DescriptionView;
 use crate::segmentation::Surface;
-use crate::store::{Digest, LabelRow, LabelSummary, LabelVersionRow, Tx};
+use crate::store::{Digest, LabelSummary, LabelVersionRow, ShapeId};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -21,10 +24,7 @@ use std::collections::BTreeSet;
 pub const MAX_LABEL: u32 = 65_535;
 /// Most labels of a collection that a person can use.
 pub const MAX_LABELS: usize = 64;
-/// Share of a shape's area that a person must have labelled for the shape to say which labels there are.
-const WHOLE: f64 = 0.9;
-
-/// What a person says of a shape.
+/// Labels that a person gives to faces of a shape.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Correction {
     /// A label for each polygon `(n_polygons,)`; -1 leaves the polygon alone.
@@ -65,15 +65,62 @@ pub struct Corrected {
     pub job: u64,
 }
 
-/// Labels that a person used, and whether they are all there is.
-pub(super) struct Vocabulary {
-    pub(super) labels: BTreeSet<LabelId>,
-    pub(super) closed: bool,
+impl Correction {
+    /// What tells this correction from every other of the same shape. The layout is versioned:
+    /// another one would refuse an honest repeat of a request that was answered before.
+    fn digest(&self, collection: &str, shape: &str) -> Digest {
+        let mut fields = blake3::Hasher::new();
+        let mut field = |bytes: &[u8]| {
+            fields.update(&(bytes.len() as u64).to_le_bytes());
+            fields.update(bytes);
+        };
+        field(b"correct v1");
+        field(collection.as_bytes());
+        field(shape.as_bytes());
+        match self {
+            Self::Whole(labels) => {
+                field(b"whole");
+                field(bytemuck::cast_slice(labels));
+            }
+            Self::Faces { faces, label } => {
+                field(b"faces");
+                field(bytemuck::cast_slice(faces));
+                field(&label.to_le_bytes());
+            }
+            Self::Part { part, label } => {
+                field(b"part");
+                field(&part.to_le_bytes());
+                field(&label.to_le_bytes());
+            }
+        }
+        Digest(*fields.finalize().as_bytes())
+    }
+
+    /// The digest that version 0.1.0 stored: of this value as text.
+    fn digest_of_first_release(&self, collection: &str, shape: &str) -> Digest {
+        let text = match self {
+            Self::Whole(labels) => format!("Whole({labels:?})"),
+            Self::Faces { faces, label } => format!("Faces {{ faces: {faces:?}, label: {label} }}"),
+            Self::Part { part, label } => format!("Part {{ part: {part}, label: {label} }}"),
+        };
+        Digest::of(format!("correct {collection:?} {shape:?} {text}").as_bytes())
+    }
+}
+
+/// A correction before it is written.
+struct Corrects {
+    change: Change,
+    /// Version of the shape's labels then.
+    version: u64,
+    n_faces: u64,
+    area_share: f64,
+    changed_share: f64,
 }
 
 impl Library {
-    /// Labels faces of a shape by hand. They keep these labels for ever; those of other shapes follow, in the
-    /// background, from this shape and the others that were corrected. Ids that are not there are created.
+    /// Labels faces of a shape by hand. They keep these labels until a person changes them; those
+    /// of other shapes follow, in the background, from all corrected shapes. Ids that do not exist
+    /// are created.
     ///
     /// # Errors
     /// There is no such collection or shape, or a label or a number of labels is out of range.
@@ -84,197 +131,126 @@ impl Library {
         correction: &Correction,
         key: Option<&RequestKey>,
     ) -> Result<Corrected> {
-        let text = format!("correct {collection:?} {shape:?} {correction:?}");
-        let request = Digest::of(text.as_bytes());
+        let request = Request {
+            earlier: Some(correction.digest_of_first_release(collection, shape)),
+            ..Request::new(key, correction.digest(collection, shape))
+        };
         let row = self.collection_row(collection)?;
-        self.with_lane(row, |lane| {
-            if let Some(reply) = self.answered(key, request)? {
+        self.with_collection(row, |in_memory| {
+            if let Some(reply) = answered(&self.store, &request)? {
                 return from_reply(&reply);
             }
             let id = self.shape_row(collection, shape)?.1.id;
-            let known = self.known(id)?;
-            let view = known.mapped.view();
-            let said = polygon_labels(&known, &view, correction)?;
-            let pinned = self.store.catalog().read(|r| r.pins(id))?;
-            let mut pins = pinned.unwrap_or_else(|| vec![-1; said.len()]);
-            for (pin, said) in pins.iter_mut().zip(&said) {
-                if *said >= 0 {
-                    *pin = *said;
-                }
-            }
-            let before = self.vocabulary(lane, None)?;
-            let after = self.vocabulary(lane, Some((&known, &pins)))?;
-            let in_use = active_labels(lane, &before);
-            if after.labels.len() > MAX_LABELS {
-                let message = format!(
-                    "collection {collection:?} would have {} labels, the limit is {MAX_LABELS}",
-                    after.labels.len()
-                );
-                return Err(LibraryError::invalid("LABEL_LIMIT", message));
-            }
-            let new = corrected_labels(&known, &view, &pins);
-            let moved = moves(
-                &known.labels.polygon_labels,
-                &new.row.polygon_labels,
-                view.polygon_area,
-            );
-            let covered = pinned_share(&view, &pins);
-            let whole = pins.iter().all(|p| *p >= 0);
-            let mut state = lane.state.clone();
-            let mut teaching = match state.teaching.take() {
-                Some(teaching) => teaching,
-                None => self.discovered(lane)?,
-            };
-            teaching.pending = true;
-            teaching.normalised = false;
-            teaching.closed = after.closed;
-            state.teaching = Some(teaching);
-            let reply = self.once(key, request, |tx| {
-                let collection = lane.row.id;
-                let before = Before::labels(tx, lane, &[id])?;
-                let detail = to_json(&serde_json::json!({ "shape": shape }));
-                tx.insert_correction(collection, "correct", &detail, &before.encode())?;
-                for label in after.labels.iter().filter(|l| !in_use.contains(l)) {
-                    use_label(tx, lane, *label)?;
-                }
-                if after.closed {
-                    for label in in_use.iter().filter(|l| !after.labels.contains(l)) {
-                        event(tx, collection, &EventKind::LabelRetired { label: *label })?;
-                    }
-                }
-                tx.set_pins(id, Some(&pins))?;
-                let corrected = EventKind::Corrected {
-                    shape: shape.into(),
-                    version: known.row.version + 1,
-                    n_faces: pins.iter().filter(|p| **p >= 0).count() as u64,
-                    area_share: covered,
-                };
-                event(tx, collection, &corrected)?;
-                let changed = EventKind::LabelsChanged {
-                    shape: shape.into(),
-                    version: known.row.version + 1,
-                    cause: cause::CORRECTION.into(),
-                    moves: moved.clone(),
-                };
-                let mut labels = new;
-                labels.row.version = known.row.version + 1;
-                labels.row.cause = cause::CORRECTION.into();
-                labels.row.sequence = event(tx, collection, &changed)?;
-                tx.put_labels(id, &labels.row, &labels.summary)?;
-                tx.mark_all_stale(collection)?;
-                tx.set_stale(id, !whole)?;
-                let n_stale = tx.n_stale(collection)?;
-                let job = tx.insert_job(&lane.row.name, unix_secs(), &[])?;
-                let state = CollectionState {
-                    carrying: Some(CarryingState {
-                        job,
-                        n_shapes: n_stale,
-                    }),
-                    ..state.clone()
-                };
-                tx.set_state(collection, to_json(&state).as_bytes())?;
-                let row = collection_row(tx, collection)?;
+            let corrects = corrects(in_memory, &self.store, id, correction)?;
+            let Corrects {
+                change,
+                version,
+                n_faces,
+                area_share,
+                changed_share,
+            } = corrects;
+            let reply = commit_once(&self.store, in_memory, change, &request, |tx, now| {
                 let corrected = Corrected {
-                    version: labels.row.version,
-                    sequence: row.sequence,
-                    n_faces: pins.iter().filter(|p| **p >= 0).count() as u64,
-                    area_share: covered,
-                    changed_share: moved.iter().map(|m| m.area_share).sum(),
-                    n_stale,
-                    job,
+                    version,
+                    sequence: now.row.sequence,
+                    n_faces,
+                    area_share,
+                    changed_share,
+                    n_stale: tx.n_stale(now.row.id)?,
+                    job: now.job,
                 };
                 Ok(to_json(&corrected).into_bytes())
             })?;
-            self.reload(lane)?;
             from_reply(&reply)
         })
     }
+}
 
-    /// The labels that persons used in a collection, with the pins of one shape as they will be.
-    pub(super) fn vocabulary(
-        &self,
-        lane: &Lane,
-        with: Option<(&Known, &[i32])>,
-    ) -> Result<Vocabulary> {
-        let mut labels = BTreeSet::new();
-        let mut closed = false;
-        let mut take = |view: &DescriptionView<'_>, pins: &[i32]| {
-            labels.extend(pins.iter().filter_map(|p| u32::try_from(*p).ok()));
-            closed |= pinned_share(view, pins) >= WHOLE;
-        };
-        for shape in lane.shapes.iter().filter(|s| s.pinned) {
-            if with.is_some_and(|(known, _)| known.row.id == shape.id) {
-                continue;
-            }
-            let (known, pins) = self.pinned(shape.id)?;
-            take(&known.mapped.view(), &pins);
+/// What a correction of one shape changes.
+fn corrects(
+    collection: &Collection,
+    sources: &dyn Sources,
+    id: ShapeId,
+    correction: &Correction,
+) -> Result<Corrects> {
+    let known = sources.known(id)?;
+    let view = known.view();
+    let given = polygon_labels(&known, &view, correction)?;
+    let pins = sources.pins(id)?;
+    let mut pins = pins.unwrap_or_else(|| vec![-1; given.len()]);
+    for (pin, given) in pins.iter_mut().zip(&given) {
+        if *given >= 0 {
+            *pin = *given;
         }
-        if let Some((known, pins)) = with {
-            take(&known.mapped.view(), pins);
-        }
-        Ok(Vocabulary { labels, closed })
     }
-
-    /// A shape that a person labelled, with its pinned polygons.
-    pub(super) fn pinned(&self, id: crate::store::ShapeId) -> Result<(Known, Vec<i32>)> {
-        let pins = self.store.catalog().read(|r| r.pins(id))?;
-        let gone = || damaged("pins", &format!("row {id} is gone"));
-        Ok((self.known(id)?, pins.ok_or_else(gone)?))
+    let before = used_labels(collection, sources, None)?;
+    let after = used_labels(collection, sources, Some(Instead::Pinned(&known, &pins)))?;
+    if after.labels.len() > MAX_LABELS {
+        let message = format!(
+            "collection {:?} would have {} labels, the limit is {MAX_LABELS}",
+            collection.row().name,
+            after.labels.len()
+        );
+        return Err(LibraryError::invalid(Reason::LabelLimit, message));
     }
-
-    /// What goes on counting of the labels that were discovered, when discovery ends.
-    pub(super) fn discovered(&self, lane: &Lane) -> Result<Teaching> {
-        let mut teaching = Teaching::default();
-        if let Some(learnt) = &lane.learnt {
-            teaching.discovered_labels.clone_from(&learnt.model.labels);
-            let chosen = lane
-                .shapes
-                .iter()
-                .filter(|s| lane.state.representatives.contains(&s.ordinal) && !s.stale);
-            for shape in chosen {
-                let version = self.store.catalog().read(|r| -> Result<_> {
-                    Ok(r.shape(shape.id)?.map_or(0, |row| row.version))
-                })?;
-                teaching.discovered.push((shape.ordinal, version));
-            }
-        }
-        Ok(teaching)
+    let in_use = active_labels(collection, &before);
+    let new = after.labels.iter().filter(|l| !in_use.contains(l));
+    let mut labels: Vec<LabelEdit> = new.map(|label| LabelEdit::Used(*label)).collect();
+    if after.vocabulary == Vocabulary::Closed {
+        let retired = in_use.iter().filter(|l| !after.labels.contains(l));
+        labels.extend(retired.map(|label| LabelEdit::Retired(*label)));
     }
+    let new = corrected_labels(&known, &view, &pins);
+    let relabelled = Relabelled::new(&known, new, cause::CORRECTION);
+    let version = relabelled.labels.row.version;
+    let n_faces = pins.iter().filter(|p| **p >= 0).count() as u64;
+    let area_share = pinned_share(&view, &pins);
+    let changed_share = relabelled.moves.iter().map(|m| m.area_share).sum();
+    let is_whole = pins.iter().all(|p| *p >= 0);
+    let shape = known.row.name.clone();
+    let change = Change {
+        undoable: Some(Undoable::Correct {
+            shape: shape.clone(),
+        }),
+        labels,
+        pins: vec![(id, Some(pins))],
+        closing: Some(EventKind::Corrected {
+            shape,
+            version,
+            n_faces,
+            area_share,
+        }),
+        relabelled: vec![relabelled],
+        staleness: Staleness::All,
+        stale: vec![(id, !is_whole)],
+        state: Some(supervised::corrected(
+            collection,
+            sources,
+            after.vocabulary,
+        )?),
+        propagates: true,
+        ..Change::default()
+    };
+    Ok(Corrects {
+        change,
+        version,
+        n_faces,
+        area_share,
+        changed_share,
+    })
 }
 
 /// Labels that shapes of a collection may carry before a change.
-fn active_labels(lane: &Lane, used: &Vocabulary) -> BTreeSet<LabelId> {
+fn active_labels(collection: &Collection, used: &UsedLabels) -> BTreeSet<LabelId> {
     let mut labels = used.labels.clone();
-    if !lane.state.teaching.as_ref().is_some_and(|t| t.closed) {
-        labels.extend(lane.learnt.iter().flat_map(|l| &l.model.labels));
+    let supervision = collection.state().regime.supervision();
+    if !supervision.is_some_and(Supervision::is_closed) {
+        labels.extend(collection.label_model().iter().flat_map(|m| &m.labels));
     }
     labels
 }
 
-/// Brings a label into use that a person named by its id.
-fn use_label(tx: &Tx<'_>, lane: &Lane, id: LabelId) -> Result<()> {
-    let collection = lane.row.id;
-    let there = tx.labels(collection)?.into_iter().find(|l| l.id == id);
-    let row = match there {
-        // In use again: what it was merged into keeps what it has.
-        Some(row) => LabelRow {
-            merged_into: None,
-            ..row
-        },
-        None => LabelRow {
-            id,
-            name: None,
-            colour: label_colour(id),
-            merged_into: None,
-        },
-    };
-    tx.reserve_label(collection, id)?;
-    tx.put_label(collection, &row)?;
-    event(tx, collection, &EventKind::LabelCreated { label: id })?;
-    Ok(())
-}
-
-/// What a correction says of each polygon; -1: nothing.
+/// The label that a correction gives each polygon; -1: none.
 fn polygon_labels(
     known: &Known,
     view: &DescriptionView<'_>,
@@ -285,23 +261,23 @@ fn polygon_labels(
     let in_range = |label: LabelId| -> Result<i32> {
         if label > MAX_LABEL {
             let message = format!("the label is {label}, but must be at most {MAX_LABEL}");
-            return Err(LibraryError::invalid("LABEL_RANGE", message));
+            return Err(LibraryError::invalid(Reason::LabelRange, message));
         }
         Ok(label as i32)
     };
-    let mut said = vec![-1; n];
+    let mut given = vec![-1; n];
     match correction {
         Correction::Whole(labels) => {
             if labels.len() != n {
                 let found = labels.len();
                 let message =
                     format!("{found} labels were given, but shape {name:?} has {n} faces");
-                return Err(LibraryError::invalid("LABEL_COUNT", message));
+                return Err(LibraryError::invalid(Reason::LabelCount, message));
             }
             let bad = labels.iter().position(|l| *l < -1 || *l > MAX_LABEL as i32);
             if let Some(face) = bad {
                 return Err(LibraryError::InvalidFace {
-                    reason: "LABEL_RANGE",
+                    reason: Reason::LabelRange,
                     message: format!(
                         "the label of face {face} is {}, but must be -1 to {MAX_LABEL}",
                         labels[face]
@@ -309,14 +285,14 @@ fn polygon_labels(
                     subject: FailureSubject::Face(face as u64),
                 });
             }
-            said.clone_from(labels);
+            given.clone_from(labels);
         }
         Correction::Faces { faces, label } => {
             let label = in_range(*label)?;
             for face in faces {
-                let Some(slot) = said.get_mut(*face as usize) else {
+                let Some(slot) = given.get_mut(*face as usize) else {
                     return Err(LibraryError::InvalidFace {
-                        reason: "FACE_INDEX",
+                        reason: Reason::FaceIndex,
                         message: format!("face {face} is named, but shape {name:?} has {n}"),
                         subject: FailureSubject::Face(u64::from(*face)),
                     });
@@ -331,9 +307,9 @@ fn polygon_labels(
             let Some(id) = pieces.label.get(*part as usize) else {
                 let n = pieces.label.len();
                 let message = format!("part {part} is named, but shape {name:?} has {n}");
-                return Err(LibraryError::invalid("PART_INDEX", message));
+                return Err(LibraryError::invalid(Reason::PartIndex, message));
             };
-            for (p, slot) in said.iter_mut().enumerate() {
+            for (p, slot) in given.iter_mut().enumerate() {
                 let is_in = pieces.part_of_face[view.face_map[p] as usize] == *part;
                 if is_in && known.labels.polygon_labels[p] == *id as i32 {
                     *slot = label;
@@ -341,24 +317,12 @@ fn polygon_labels(
             }
         }
     }
-    if said.iter().all(|l| *l < 0) {
+    if given.iter().all(|l| *l < 0) {
         let message =
             format!("no face of shape {name:?} is given a label, so nothing is corrected");
-        return Err(LibraryError::invalid("NOTHING_CORRECTED", message));
+        return Err(LibraryError::invalid(Reason::NothingCorrected, message));
     }
-    Ok(said)
-}
-
-/// Share of the area of a shape that is pinned.
-pub(super) fn pinned_share(view: &DescriptionView<'_>, pins: &[i32]) -> f64 {
-    let area = view.polygon_area.iter().map(|a| f64::from(*a));
-    let total: f64 = area.clone().sum();
-    let pinned: f64 = area
-        .zip(pins)
-        .filter(|(_, p)| **p >= 0)
-        .map(|(a, _)| a)
-        .sum();
-    pinned / total.max(1e-300)
+    Ok(given)
 }
 
 /// The newest labels of a shape with those that a person gave in their place.
@@ -378,12 +342,10 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
         .collect::<BTreeSet<_>>()
         .into_iter()
         .collect();
-    let class = |pin: &i32| labels.binary_search(pin).ok().map(|c| c as u32);
-    let classes: Vec<Option<u32>> = pins.iter().map(class).collect();
     for (label, pin) in row
         .proxy_labels
         .iter_mut()
-        .zip(proxy_pins(view, &classes, labels.len()))
+        .zip(pinned_faces(view, pins, &labels))
     {
         if let Some(class) = pin {
             *label = labels[class as usize];
@@ -410,16 +372,55 @@ fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> 
     NewLabels { row, summary }
 }
 
-/// Puts the labels that a person gave in the place of those that were found.
-pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
-    let slots = row
-        .polygon_labels
-        .iter_mut()
-        .zip(&mut row.polygon_confidence);
-    for ((label, confidence), pin) in slots.zip(pins) {
-        if *pin >= 0 {
-            *label = *pin;
-            *confidence = u8::MAX;
+#[cfg(test)]
+mod tests {
+    use super::Correction;
+    use crate::store::Digest;
+
+    /// A repeat of a request that an earlier version answered is known by this text.
+    #[test]
+    fn the_first_release_s_digest_is_that_of_the_value_as_text() {
+        let part = Correction::Part { part: 3, label: 7 };
+        let faces = Correction::Faces {
+            faces: vec![2, 0],
+            label: 9,
+        };
+        for (correction, text) in [
+            (Correction::Whole(vec![-1, 4]), "Whole([-1, 4])"),
+            (faces, "Faces { faces: [2, 0], label: 9 }"),
+            (part, "Part { part: 3, label: 7 }"),
+        ] {
+            assert_eq!(
+                format!("{correction:?}"),
+                text,
+                "the first release used Debug"
+            );
+            let text = format!("correct \"a\" \"b\\n\" {text}");
+            let digest = correction.digest_of_first_release("a", "b\n");
+            assert_eq!(digest, Digest::of(text.as_bytes()));
         }
+    }
+
+    #[test]
+    fn corrections_that_differ_have_other_digests() {
+        let faces = |faces: &[u32], label| Correction::Faces {
+            faces: faces.to_vec(),
+            label,
+        };
+        let part = |part, label| Correction::Part { part, label };
+        let all = [
+            ("a", "b", Correction::Whole(vec![1, 2])),
+            ("a", "b", Correction::Whole(vec![2, 1])),
+            ("ab", "", Correction::Whole(vec![1, 2])),
+            ("a", "b", faces(&[1], 2)),
+            ("a", "b", faces(&[1, 2], 2)),
+            ("a", "b", faces(&[], 1)),
+            ("a", "b", part(1, 2)),
+            ("a", "b", part(2, 1)),
+        ];
+        let digest = |c: &(&str, &str, Correction)| c.2.digest(c.0, c.1).0;
+        let distinct: std::collections::BTreeSet<[u8; 32]> = all.iter().map(digest).collect();
+        assert_eq!(distinct.len(), all.len());
+        assert_eq!(digest(&all[0]), digest(&all[0].clone()));
     }
 }

@@ -1,8 +1,11 @@
 //! Why an operation on the library failed.
 
 use super::likely::{did_you_mean, likeliest};
-use super::{Failure, FailureSubject};
+use super::reason::{Code, Reason};
+use super::types::{Failure, FailureSubject};
 use crate::store::StoreError;
+
+pub(super) type Result<T> = std::result::Result<T, LibraryError>;
 
 /// Why an operation on the library failed.
 #[derive(Debug, thiserror::Error)]
@@ -10,34 +13,25 @@ use crate::store::StoreError;
 pub enum LibraryError {
     /// Names what is wrong and the limit. `reason` is stable.
     #[error("{message}")]
-    InvalidArgument {
-        reason: &'static str,
-        message: String,
-    },
+    InvalidArgument { reason: Reason, message: String },
     /// The same, of one place in the input.
     #[error("{message}")]
     InvalidFace {
-        reason: &'static str,
+        reason: Reason,
         message: String,
         subject: FailureSubject,
     },
     /// `nearest` is what was probably meant.
     #[error("no {what} named {name:?}{}", did_you_mean(nearest.as_deref()))]
     NotFound {
-        what: &'static str,
+        what: Named,
         name: String,
         nearest: Option<String>,
     },
     #[error("{message}")]
-    AlreadyExists {
-        reason: &'static str,
-        message: String,
-    },
+    AlreadyExists { reason: Reason, message: String },
     #[error("{message}")]
-    FailedPrecondition {
-        reason: &'static str,
-        message: String,
-    },
+    FailedPrecondition { reason: Reason, message: String },
     /// A shape was refused.
     #[error("{}", .0.message)]
     Refused(Failure),
@@ -45,9 +39,74 @@ pub enum LibraryError {
     Store(#[from] StoreError),
 }
 
+/// What a library looks up by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Named {
+    Collection,
+    Shape,
+    Label,
+    Job,
+    JobItem,
+    Version,
+}
+
+impl std::fmt::Display for Named {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Collection => "collection",
+            Self::Shape => "shape",
+            Self::Label => "label",
+            Self::Job => "job",
+            Self::JobItem => "job item",
+            Self::Version => "version",
+        })
+    }
+}
+
+impl From<&LibraryError> for Failure {
+    fn from(error: &LibraryError) -> Self {
+        let (code, reason) = match error {
+            LibraryError::InvalidArgument { reason, .. }
+            | LibraryError::InvalidFace { reason, .. } => (Code::InvalidArgument, *reason),
+            LibraryError::NotFound { what, .. } => (
+                Code::NotFound,
+                match what {
+                    Named::Collection => Reason::NoCollection,
+                    Named::Shape => Reason::NoShape,
+                    Named::Label => Reason::NoLabel,
+                    Named::Job => Reason::NoJob,
+                    Named::Version => Reason::NoVersion,
+                    Named::JobItem => Reason::Unspecified,
+                },
+            ),
+            LibraryError::AlreadyExists { reason, .. } => (Code::AlreadyExists, *reason),
+            LibraryError::FailedPrecondition { reason, .. } => (Code::FailedPrecondition, *reason),
+            LibraryError::Refused(failure) => return failure.clone(),
+            LibraryError::Store(StoreError::NoSpace { .. }) => {
+                (Code::ResourceExhausted, Reason::NoSpace)
+            }
+            LibraryError::Store(StoreError::ReadOnly { .. }) => {
+                (Code::FailedPrecondition, Reason::ReadOnly)
+            }
+            LibraryError::Store(e) if e.is_damage() => (Code::DataLoss, Reason::Damaged),
+            LibraryError::Store(_) => (Code::Internal, Reason::Store),
+        };
+        Self {
+            code,
+            reason,
+            message: error.to_string(),
+            subject: match error {
+                LibraryError::InvalidFace { subject, .. } => Some(*subject),
+                _ => None,
+            },
+        }
+    }
+}
+
 impl LibraryError {
     /// There is nothing of that name.
-    pub(super) fn not_found(what: &'static str, name: impl Into<String>) -> Self {
+    pub(super) fn not_found(what: Named, name: impl Into<String>) -> Self {
         Self::NotFound {
             what,
             name: name.into(),
@@ -56,7 +115,7 @@ impl LibraryError {
     }
 
     /// There is none of that name among `known`, of which one may have been meant.
-    pub(super) fn none_of(what: &'static str, name: &str, known: &[String]) -> Self {
+    pub(super) fn none_of(what: Named, name: &str, known: &[String]) -> Self {
         let nearest = likeliest(name, known.iter().map(String::as_str));
         Self::NotFound {
             what,
@@ -65,7 +124,15 @@ impl LibraryError {
         }
     }
 
-    pub(super) fn invalid(reason: &'static str, message: String) -> Self {
+    /// The collection was deleted while it was in use.
+    pub(super) fn deleted(collection: &str) -> Self {
+        Self::FailedPrecondition {
+            reason: Reason::Gone,
+            message: format!("collection {collection:?} was deleted meanwhile"),
+        }
+    }
+
+    pub(super) fn invalid(reason: Reason, message: String) -> Self {
         Self::InvalidArgument { reason, message }
     }
 }

@@ -2,11 +2,12 @@
 //!
 //! Both ends are the same program, so nothing here has a version.
 
+use super::error::{LibraryError, Result};
+use super::refusal::refusal;
 use super::rows::{
     format_from_name, operator_from_name, operator_name, report_from_json, report_to_json,
 };
-use super::submit::refusal;
-use super::{Failure, LibraryError, Result};
+use super::types::Failure;
 use crate::mesh::{CleanReport, Format};
 use crate::pipeline::{Description, Params, describe};
 use serde::{Deserialize, Serialize};

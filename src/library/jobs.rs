@@ -1,9 +1,14 @@
 //! Jobs for the operator: attempts that failed, jobs that failed, and trying again.
 
-use super::rows::{CollectionState, to_json};
-use super::{Carrying, Job, JobItem, Library, LibraryError, Result};
-use crate::store::{ItemStatus, ObjectKind};
+use super::collection::State;
+use super::error::{LibraryError, Named, Result};
+use super::facade::Library;
+use super::reason::Reason;
+use super::rows::{damaged, from_json, to_json};
+use super::types::{ItemState, Job, JobItem, PropagationProgress};
+use crate::store::{ItemStatus, JobItemRow, ObjectKind, Tx};
 use serde::{Deserialize, Serialize};
+use std::sync::PoisonError;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Jobs that are over are kept this long, and so are the bytes of shapes that failed.
@@ -11,12 +16,12 @@ const JOB_AGE_SECS: u64 = 30 * 24 * 60 * 60;
 /// Replies are kept this long.
 const REPLY_AGE_SECS: u64 = 7 * 24 * 60 * 60;
 
-/// What is kept of an item that is still queued.
+/// The stored detail of an item that is still queued.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Attempts {
     /// How often the work on it ended its process.
     pub(super) attempts: u32,
-    /// How the last time.
+    /// How the work ended the last time.
     why: String,
 }
 
@@ -32,24 +37,129 @@ pub struct JobFilter {
 }
 
 impl Library {
-    /// How far the correction of a job is carried. Nothing is left of it once the collection is gone, or once a later
-    /// change has taken its place.
-    pub(super) fn carrying(&self, job: u64, collection: &str) -> Result<Carrying> {
-        self.store.catalog().read(|r| -> Result<Carrying> {
-            let Some(row) = r.collection(collection)? else {
-                return Ok(Carrying::default());
-            };
-            let state = CollectionState::of(&row)?;
-            let newest = state.carrying.filter(|c| c.job == job);
-            let n_stale = r.n_stale(row.id)?;
-            Ok(newest.map_or_else(Carrying::default, |c| Carrying {
-                n_shapes: c.n_shapes,
-                n_left: n_stale.min(c.n_shapes),
-            }))
+    /// How far the correction of a job is propagated. Nothing remains to be done once the collection is
+    /// deleted, or once a later change has taken its place.
+    pub(super) fn propagation(&self, job: u64, collection: &str) -> Result<PropagationProgress> {
+        self.store
+            .catalog()
+            .read(|r| -> Result<PropagationProgress> {
+                let Some(row) = r.collection(collection)? else {
+                    return Ok(PropagationProgress::default());
+                };
+                let state = State::of(&row)?;
+                let newest = state.propagation.filter(|c| c.job == job);
+                let n_stale = r.n_stale(row.id)?;
+                Ok(
+                    newest.map_or_else(PropagationProgress::default, |c| PropagationProgress {
+                        n_shapes: c.n_shapes,
+                        n_left: n_stale.min(c.n_shapes),
+                    }),
+                )
+            })
+    }
+
+    pub(super) fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
+        let row = self
+            .store
+            .catalog()
+            .read(|r| r.job_item(item.job, item.index).map_err(LibraryError::from))?;
+        row.ok_or_else(|| {
+            let name = format!("{} of job {}", item.index, item.job);
+            LibraryError::not_found(Named::JobItem, name)
         })
     }
 
-    /// Notes durably that the work on an item ended its process once more; how often now.
+    pub(super) fn item(&self, row: JobItemRow) -> Result<JobItem> {
+        let place = format!("job_items {}, {}", row.job, row.index);
+        let detail = || {
+            row.detail_json
+                .as_deref()
+                .ok_or_else(|| damaged(&place, "no detail"))
+        };
+        let attempts = match (row.status, &row.detail_json) {
+            (ItemStatus::Queued, Some(detail)) => from_json::<Attempts>(detail, &place)?.attempts,
+            _ => 0,
+        };
+        let state = match row.status {
+            ItemStatus::Queued => {
+                let running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
+                let stage = running.get(&(row.job, row.index)).cloned();
+                stage.map_or(ItemState::Queued, ItemState::Running)
+            }
+            ItemStatus::Done => ItemState::Done(Box::new(from_json(detail()?, &place)?)),
+            ItemStatus::Failed => ItemState::Failed(from_json(detail()?, &place)?),
+            ItemStatus::Cancelled => ItemState::Cancelled,
+        };
+        Ok(JobItem {
+            job: row.job,
+            index: row.index,
+            collection: row.collection,
+            name: row.item.name,
+            state,
+            attempts,
+        })
+    }
+
+    /// A job as it stands.
+    ///
+    /// # Errors
+    /// There is none of the id.
+    pub fn job(&self, id: u64) -> Result<Job> {
+        let (job, items) = self.store.catalog().read(|r| -> Result<_> {
+            let job = r.job(id)?;
+            let job = job.ok_or_else(|| LibraryError::not_found(Named::Job, id.to_string()))?;
+            Ok((job, r.job_items(id)?))
+        })?;
+        let propagation = if items.is_empty() {
+            Some(self.propagation(id, &job.collection)?)
+        } else {
+            None
+        };
+        let items = items
+            .into_iter()
+            .map(|i| self.item(i))
+            .collect::<Result<_>>()?;
+        Ok(Job {
+            id,
+            collection: job.collection,
+            items,
+            propagation,
+        })
+    }
+
+    /// Items not yet done, in order of acceptance: a daemon resumes them when it starts.
+    ///
+    /// # Errors
+    /// The catalog cannot be read.
+    pub fn queued_items(&self) -> Result<Vec<JobItem>> {
+        let rows = self
+            .store
+            .catalog()
+            .read(|r| r.queued_items().map_err(LibraryError::from))?;
+        rows.into_iter().map(|i| self.item(i)).collect()
+    }
+
+    /// Cancels the items of a job that are not done.
+    ///
+    /// # Errors
+    /// There is no such job.
+    pub fn cancel(&self, job: u64) -> Result<Job> {
+        self.job(job)?;
+        let cancel = |tx: &Tx<'_>| -> Result<()> {
+            for item in tx
+                .job_items(job)?
+                .iter()
+                .filter(|i| i.status == ItemStatus::Queued)
+            {
+                tx.set_item(job, item.index, ItemStatus::Cancelled, None)?;
+            }
+            Ok(())
+        };
+        self.store.freeing(|| self.store.catalog().write(cancel))?;
+        self.job(job)
+    }
+
+    /// Counts durably that the work on an item ended its process once more; returns the new count.
     ///
     /// # Errors
     /// The catalog cannot be written.
@@ -90,8 +200,8 @@ impl Library {
                 let is_carrying = items.is_empty();
                 let items = items.into_iter().filter(|i| is_listed(i.status));
                 Ok(Job {
-                    carrying: if is_carrying {
-                        Some(self.carrying(job.id, &job.collection)?)
+                    propagation: if is_carrying {
+                        Some(self.propagation(job.id, &job.collection)?)
                     } else {
                         None
                     },
@@ -103,7 +213,8 @@ impl Library {
             .collect()
     }
 
-    /// Queues the failed items of a job again, with all attempts before them; the job, and which items.
+    /// Queues the failed items of a job again, with all attempts before them; the job, and which
+    /// items.
     ///
     /// # Errors
     /// There is no such job, or the bytes of a failed shape are kept no longer.
@@ -120,7 +231,7 @@ impl Library {
                     .is_none()
                 {
                     return Err(LibraryError::FailedPrecondition {
-                        reason: "ORIGINAL_GONE",
+                        reason: Reason::OriginalGone,
                         message: format!(
                             "the bytes of shape {:?} are kept no longer; add it again",
                             row.item.name
@@ -138,8 +249,8 @@ impl Library {
         Ok((job, items))
     }
 
-    /// Forgets replies and jobs that are so old that nobody asks for them. To be called about hourly; a clock that
-    /// jumps makes nothing older.
+    /// Forgets replies and jobs that are so old that nobody asks for them. To be called about
+    /// hourly; a clock that jumps makes nothing older.
     ///
     /// # Errors
     /// The catalog cannot be written.

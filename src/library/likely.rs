@@ -1,4 +1,4 @@
-//! What was probably meant by a name that nothing has.
+//! Finds the known name that was probably meant by an unknown one.
 
 use std::cmp::Reverse;
 use strsim::osa_distance;
@@ -24,7 +24,8 @@ pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Op
             return None;
         }
         let distance = osa_distance(&wanted, &folded);
-        // Of names as near, the one that begins the same: `chair-1` meant `chair-001`, not `chairs`.
+        // Of names as near, the one that begins the same: `chair-1` meant `chair-001`, not
+        // `chairs`.
         let begins = wanted.chars().zip(folded.chars());
         let n_same = begins.take_while(|(a, b)| a == b).count();
         (distance <= slips).then_some(((distance, Reverse(n_same)), candidate))

@@ -1,6 +1,7 @@
 //! Names that people, file systems and logs can live with, and how others are shown.
 
-use super::{LibraryError, Result};
+use super::error::{LibraryError, Result};
+use super::reason::Reason;
 use std::borrow::Cow;
 
 /// Letters of other scripts that look like Latin ones.
@@ -20,7 +21,7 @@ pub fn check_shape_name(name: &str) -> Result<()> {
 
 /// Refuses a name that is too long, cannot stand in a path, or has characters that nobody sees.
 pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
-    let bad = |message: String| Err(LibraryError::invalid("BAD_NAME", message));
+    let bad = |message: String| Err(LibraryError::invalid(Reason::BadName, message));
     let n = name.chars().count();
     if n == 0 || n > limit {
         return bad(format!(

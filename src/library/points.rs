@@ -1,7 +1,10 @@
-//! Maps between the points of two stored shapes, and values carried by them.
+//! Maps between the points of two stored shapes, and values transferred through them.
 
+use super::error::{LibraryError, Result};
+use super::facade::Library;
+use super::reason::Reason;
 use super::rows::{from_json, to_json};
-use super::{Library, LibraryError, Result};
+use super::sources::Sources;
 use crate::fmap::transfer::{faces_to_faces, labels_to_faces};
 use crate::fmap::{
     Assessment, Basis, EstimateOptions, PointMap, PointShape, Quality, Side, point_maps,
@@ -10,10 +13,10 @@ use crate::pipeline::DescriptionView;
 use crate::store::PointMapRow;
 use serde::{Deserialize, Serialize};
 
-/// Part of the key of a kept map: raised when the same request would find another one.
+/// Part of the key of a stored map: raised when the same request would find another one.
 const RECIPE: u32 = 1;
 
-/// What is asked of a map between points.
+/// What a map between points must satisfy.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PointRequest {
     /// Proxy vertices of the first and of the second shape that correspond.
@@ -36,8 +39,8 @@ pub enum PolygonValues {
 }
 
 impl Library {
-    /// The map that carries functions on `from` to `to` point by point, and if wanted the best one of the other
-    /// orientation after it. What was found is kept: the same request finds it again.
+    /// The map that carries functions on `from` to `to` point by point, and if wanted the best one
+    /// of the other orientation after it. The maps are stored: the same request finds them again.
     ///
     /// # Errors
     /// There is no such shape, or a landmark is no vertex of its proxy.
@@ -48,31 +51,32 @@ impl Library {
         to: &str,
         request: &PointRequest,
     ) -> Result<Vec<PointMap>> {
-        if let Some(kept) = self.kept_point_maps(collection, from, to, request)? {
+        if let Some(kept) = self.stored_point_maps(collection, from, to, request)? {
             return Ok(kept);
         }
         let (_, a) = self.shape_row(collection, from)?;
         let (_, b) = self.shape_row(collection, to)?;
         let key = request_key(request);
-        let (one, two) = (self.known(a.id)?.mapped, self.known(b.id)?.mapped);
+        let (one, two) = (self.store.known(a.id)?, self.store.known(b.id)?);
         let found = maps(&one.view(), &two.view(), request)?;
         let rows: Vec<PointMapRow> = found.iter().map(to_row).collect();
         let write = self
             .store
             .catalog()
             .write(|tx| -> Result<()> { Ok(tx.put_point_maps(a.id, b.id, &key, &rows)?) });
-        // What cannot be kept, because a shape went meanwhile or the disk is full, is found again when it is asked for.
+        // Maps that cannot be stored, because a shape was removed meanwhile or the disk is full, are
+        // computed again when they are requested again.
         match write {
             Err(LibraryError::Store(e)) if e.is_damage() => Err(e.into()),
             _ => rows.into_iter().map(from_row).collect(),
         }
     }
 
-    /// What [`Library::point_maps`] gives if it is kept: nothing is computed.
+    /// What [`Library::point_maps`] returns if it is stored: nothing is computed.
     ///
     /// # Errors
     /// There is no such shape, or the map is damaged.
-    pub fn kept_point_maps(
+    pub fn stored_point_maps(
         &self,
         collection: &str,
         from: &str,
@@ -91,8 +95,9 @@ impl Library {
             .transpose()
     }
 
-    /// Values at the polygons of `from` become values at those of `to`, by the map between their points: of labels the
-    /// most frequent around the matched points, of functions the mean; −1 and NaN where nothing corresponds.
+    /// Values at the polygons of `from` become values at those of `to`, by the map between their
+    /// points: of labels the most frequent around the matched points, of functions the mean; −1 and
+    /// NaN where nothing corresponds.
     ///
     /// # Errors
     /// As [`Self::point_maps`]; or there is not one row for each polygon of `from`.
@@ -114,7 +119,7 @@ impl Library {
         };
         if rows != n_polygons {
             let text = format!("values have {rows} rows, but {from:?} has {n_polygons} polygons");
-            return Err(LibraryError::invalid("FIELD_RANGE", text));
+            return Err(LibraryError::invalid(Reason::FieldRange, text));
         }
         let found = self.point_maps(collection, from, to, request)?;
         let map = found
@@ -122,7 +127,7 @@ impl Library {
             .next()
             .expect("invariant: there is a map between any two shapes");
         let n = one.vertices.len();
-        let carried = match values {
+        let transferred = match values {
             PolygonValues::Labels(labels) => {
                 let of_face = most_frequent(&one, labels);
                 let faces =
@@ -142,11 +147,11 @@ impl Library {
                 PolygonValues::Functions(rows.collect(), *dim)
             }
         };
-        Ok((carried, map))
+        Ok((transferred, map))
     }
 }
 
-/// What is kept of a map besides its arrays.
+/// The stored part of a map besides its arrays.
 #[derive(Debug, Serialize, Deserialize)]
 struct Detail {
     descriptor_residual: f64,
@@ -161,7 +166,7 @@ struct Detail {
     cost: f64,
 }
 
-/// The name under which the maps that a request finds are kept.
+/// The key under which the maps of a request are stored.
 fn request_key(request: &PointRequest) -> String {
     let PointRequest {
         landmarks,
@@ -229,7 +234,7 @@ fn maps(
             let n = shape.vertices.len();
             if *vertex as usize >= n {
                 let text = format!("a landmark names vertex {vertex}, but the proxy has {n}");
-                return Err(LibraryError::invalid("FIELD_RANGE", text));
+                return Err(LibraryError::invalid(Reason::FieldRange, text));
             }
         }
     }
@@ -274,7 +279,8 @@ fn mean(d: &DescriptionView<'_>, values: &[f32], dim: usize) -> Vec<f32> {
         .collect()
 }
 
-/// The label with most area among the polygons of each proxy face `(m,)`; −1 where there is none, the lowest on ties.
+/// The label with most area among the polygons of each proxy face `(m,)`; −1 where there is none,
+/// the lowest on ties.
 fn most_frequent(d: &DescriptionView<'_>, labels: &[i32]) -> Vec<i32> {
     let mut kinds = labels.to_vec();
     kinds.sort_unstable();

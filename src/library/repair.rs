@@ -1,12 +1,15 @@
-//! What is damaged and can be computed again is, from the stored mesh.
+//! Recomputes from the stored mesh what is damaged and can be recomputed.
 //!
-//! The bytes that a person sent, labels, corrections and events cannot be computed: where one of these is
-//! damaged the repair says so, and a snapshot is needed. Descriptions, signatures, maps and indexes can.
+//! The bytes that a person sent, labels, corrections and events cannot be computed: where one of
+//! these is damaged the repair says so, and a snapshot is needed. Descriptions, signatures, maps
+//! and indexes can.
 
+use super::error::{LibraryError, Result};
+use super::facade::Library;
 use super::isolate::DescribeJob;
 use super::rows::format_from_name;
+use super::sources::{Sources, object};
 use super::submit::{algorithm, params_of};
-use super::{Library, LibraryError, Result};
 use crate::mesh::CleanReport;
 use crate::store::check::Finding;
 use crate::store::quarantine::{accept_loss, rebuild_indexes};
@@ -24,8 +27,8 @@ pub struct Repaired {
 }
 
 impl Library {
-    /// Mends what can be mended of the library in `dir`, which no process may hold. Damaged files are put into
-    /// `quarantine/`.
+    /// Mends what can be mended of the library in `dir`, which no process may hold. Damaged files
+    /// are put into `quarantine/`.
     ///
     /// # Errors
     /// The library is held, or so damaged that it cannot be opened.
@@ -34,7 +37,7 @@ impl Library {
         let lost = accept_loss(dir)?;
         done.extend(lost.iter().map(|what| format!("catalog.db: {what}")));
         if rebuild_indexes(dir)? {
-            done.push("catalog.db: its indexes were built anew".to_owned());
+            done.push("catalog.db: its indexes were rebuilt".to_owned());
         }
         let library = Self::open(dir)?;
         if lost.is_some() {
@@ -83,7 +86,11 @@ impl Library {
     fn repair_shape(&self, collection: &CollectionRow, shape: &ShapeRow) -> Result<Vec<String>> {
         let mut done = Vec::new();
         let place = format!("{}/{}", collection.name, shape.name);
-        let object = self.object(ObjectKind::Description, &shape.description_digest)?;
+        let object = object(
+            &self.store,
+            ObjectKind::Description,
+            &shape.description_digest,
+        )?;
         let whole = match self.store.objects().open_description(&object) {
             Ok(mapped) => mapped,
             Err(e) if e.is_damage() => {
@@ -92,7 +99,7 @@ impl Library {
                     let algorithm = algorithm(report);
                     Digest::of_description(&shape.content_digest, &params_json, &algorithm)
                 };
-                let bytes = self.original_bytes(&shape.content_digest)?;
+                let bytes = self.store.original(&shape.content_digest)?;
                 let job = DescribeJob {
                     bytes: &bytes,
                     format: format_from_name(&shape.format, "shapes.format")?,

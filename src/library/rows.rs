@@ -1,160 +1,25 @@
-//! What the catalog keeps as text becomes domain values and back.
+//! Text in the catalog becomes domain values and back.
 
-use super::{LibraryError, Result, Up};
-use crate::description::DescriptionView;
+use super::error::{LibraryError, Result};
 use crate::fmap::{Confidence, Quality, confidence};
-use crate::labels::{UpVote, contradicting_up, estimate_up};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
-use crate::store::{CollectionRow, MapRow, StoreError};
+use crate::store::{MapRow, StoreError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-
-/// What a collection keeps besides its model.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct CollectionState {
-    /// Number of shapes at which the parts are clustered anew.
-    pub(super) next_recluster: u64,
-    /// Ordinals of the shapes that were clustered together when the epoch began.
-    pub(super) representatives: Vec<u64>,
-    /// Newest ordinal when the epoch began.
-    pub(super) epoch_ordinal: u64,
-    /// Ordinals of shapes that came after that and yet inform the model not: an undone correction labelled them.
-    #[serde(default)]
-    pub(super) silent: Vec<u64>,
-    /// From the first correction on: what labels are carried from, in the place of discovery.
-    #[serde(default)]
-    pub(super) teaching: Option<Teaching>,
-    /// Where the up axis is estimated: what the shapes that the model was made of say.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) up: Option<UpState>,
-    /// Where the up axis is given: another one, along which shapes stand clearly better, and the share of those.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) up_disagrees: Option<UpState>,
-    /// The newest job that carries a correction.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(super) carrying: Option<CarryingState>,
-}
-
-impl CollectionState {
-    /// The state of a collection, as its row has it; as it begins, where there is none yet.
-    pub(super) fn of(row: &CollectionRow) -> Result<Self> {
-        let place = format!("collections {}", row.name);
-        if row.state.is_empty() {
-            return Ok(Self::default());
-        }
-        let text = std::str::from_utf8(&row.state).map_err(|e| damaged(&place, &e.to_string()))?;
-        from_json(text, &place)
-    }
-}
-
-/// The job in which a person's labels are carried to the other shapes.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub(super) struct CarryingState {
-    /// Its id.
-    pub(super) job: u64,
-    /// Shapes that were stale when it began.
-    pub(super) n_shapes: u64,
-}
-
-/// An estimated up axis.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub(super) struct UpState {
-    /// The axis, whether it is used or not.
-    pub(super) axis: [f64; 3],
-    /// Share of the shapes that agree.
-    pub(super) agreement: f64,
-}
-
-/// What shapes say of the up axis of their collection, and the axis that follows.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct UpFound {
-    /// The axis that is used, if any.
-    pub(super) axis: Option<[f64; 3]>,
-    /// As [`CollectionState::up`].
-    pub(super) estimate: Option<UpState>,
-    /// As [`CollectionState::up_disagrees`].
-    pub(super) disagrees: Option<UpState>,
-}
-
-impl UpFound {
-    /// What shapes say where this is `given`.
-    pub(super) fn of<'a>(given: Up, shapes: &[&'a DescriptionView<'a>]) -> Self {
-        if given == Up::Auto {
-            let vote = estimate_up(shapes.iter().copied());
-            return Self {
-                axis: vote.and_then(|v| v.trusted()),
-                estimate: vote.map(UpState::from),
-                disagrees: None,
-            };
-        }
-        let axis = given.axis();
-        let vote = axis.and_then(|axis| contradicting_up(axis, shapes));
-        Self {
-            axis,
-            estimate: None,
-            disagrees: vote.map(UpState::from),
-        }
-    }
-
-    /// The state of a collection with what was found.
-    pub(super) fn noted(self, state: CollectionState) -> CollectionState {
-        CollectionState {
-            up: self.estimate,
-            up_disagrees: self.disagrees,
-            ..state
-        }
-    }
-}
-
-impl From<UpVote> for UpState {
-    fn from(vote: UpVote) -> Self {
-        Self {
-            axis: vote.axis,
-            agreement: vote.agreement,
-        }
-    }
-}
-
-impl UpState {
-    /// As a vote.
-    pub(super) fn vote(&self) -> UpVote {
-        UpVote {
-            axis: self.axis,
-            agreement: self.agreement,
-        }
-    }
-}
-
-/// How the labels of a collection follow from what a person said.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Teaching {
-    /// What a person said has not been learnt yet.
-    pub(super) pending: bool,
-    /// Descriptors are standardised over the representatives that learn.
-    pub(super) normalised: bool,
-    /// Only labels that a person used are given; otherwise discovered ones count as well.
-    pub(super) closed: bool,
-    /// Ordinals of the representatives that learnt; their labels vote.
-    pub(super) taught: Vec<u64>,
-    /// Ordinals of the representatives whose discovered labels count, and the versions in which they had them.
-    pub(super) discovered: Vec<(u64, u64)>,
-    /// Label of each class in the probabilities of those versions.
-    pub(super) discovered_labels: Vec<u32>,
-}
 
 pub(super) fn to_json<T: Serialize>(value: &T) -> String {
     serde_json::to_string(value).expect("invariant: plain values serialise")
 }
 
-pub(super) fn from_json<'a, T: Deserialize<'a>>(text: &'a str, place: &str) -> Result<T> {
-    serde_json::from_str(text).map_err(|e| damaged(place, &e.to_string()))
+pub(super) fn from_json<'a, T: Deserialize<'a>>(text: &'a str, location: &str) -> Result<T> {
+    serde_json::from_str(text).map_err(|e| damaged(location, &e.to_string()))
 }
 
 /// A row of the catalog that does not hold what was written.
-pub(super) fn damaged(place: &str, message: &str) -> LibraryError {
+pub(super) fn damaged(location: &str, message: &str) -> LibraryError {
     StoreError::Damaged {
-        path: place.to_string(),
+        path: location.to_string(),
         message: message.to_string(),
     }
     .into()
@@ -171,9 +36,9 @@ pub fn report_to_json(report: &CleanReport) -> Value {
     )
 }
 
-pub(super) fn report_from_json(text: &str, place: &str) -> Result<CleanReport> {
-    let value: Value = from_json(text, place)?;
-    let missing = |name: &str| damaged(place, &format!("no count {name:?}"));
+pub(super) fn report_from_json(text: &str, location: &str) -> Result<CleanReport> {
+    let value: Value = from_json(text, location)?;
+    let missing = |name: &str| damaged(location, &format!("no count {name:?}"));
     let count = |name: &str| match value.get(name) {
         None => Ok(None),
         Some(n) => n
@@ -197,13 +62,13 @@ pub(super) fn quality_to_json(q: &Quality) -> String {
     .to_string()
 }
 
-pub(super) fn quality_from_json(text: &str, place: &str) -> Result<Quality> {
-    let value: Value = from_json(text, place)?;
+pub(super) fn quality_from_json(text: &str, location: &str) -> Result<Quality> {
+    let value: Value = from_json(text, location)?;
     let number = |name: &str| -> Result<f64> {
         value
             .get(name)
             .and_then(Value::as_f64)
-            .ok_or_else(|| damaged(place, &format!("no number {name:?}")))
+            .ok_or_else(|| damaged(location, &format!("no number {name:?}")))
     };
     let mut quality = Quality {
         descriptor_residual: number("descriptor_residual")?,
@@ -225,14 +90,15 @@ pub(super) fn quality_from_json(text: &str, place: &str) -> Result<Quality> {
     Ok(quality)
 }
 
-/// Mean squared difference of descriptors between a vertex and what its match is matched with, of an ordinary map.
+/// Mean squared difference of descriptors between a vertex and what its match is matched with, of
+/// an ordinary map.
 const TYPICAL_RETURN: f64 = 0.5;
 
 /// What to expect of a kept map at each vertex.
 pub(super) fn confidence_of_row(row: &MapRow) -> Result<Confidence> {
     if row.confidence.is_empty() {
-        let place = format!("maps {} {}", row.from, row.to);
-        let quality = quality_from_json(&row.quality_json, &place)?;
+        let location = format!("maps {} {}", row.from, row.to);
+        let quality = quality_from_json(&row.quality_json, &location)?;
         return Ok(Confidence::uniform(quality.confidence, row.p2p_21.len()));
     }
     Ok(Confidence {
@@ -249,20 +115,20 @@ pub(super) fn operator_name(operator: Operator) -> &'static str {
     }
 }
 
-pub(super) fn operator_from_name(name: &str, place: &str) -> Result<Operator> {
+pub(super) fn operator_from_name(name: &str, location: &str) -> Result<Operator> {
     let all = [Operator::Tufted, Operator::Cotan, Operator::MeshLaplace];
     let found = all.into_iter().find(|o| operator_name(*o) == name);
-    found.ok_or_else(|| damaged(place, &format!("no operator is named {name:?}")))
+    found.ok_or_else(|| damaged(location, &format!("no operator is named {name:?}")))
 }
 
 /// The format of that stored word.
-pub(super) fn format_from_name(name: &str, place: &str) -> Result<Format> {
+pub(super) fn format_from_name(name: &str, location: &str) -> Result<Format> {
     let found = Format::ALL.into_iter().find(|f| f.name() == name);
-    found.ok_or_else(|| damaged(place, &format!("no format is named {name:?}")))
+    found.ok_or_else(|| damaged(location, &format!("no format is named {name:?}")))
 }
 
-/// Colours of labels, by id: Okabe and Ito's eight, which colour-blind people can tell apart, then golden-angle
-/// hues.
+/// Colours of labels, by id: Okabe and Ito's eight, which colour-blind people can tell apart, then
+/// golden-angle hues.
 pub(super) fn label_colour(id: u32) -> [u8; 3] {
     const OKABE_ITO: [[u8; 3]; 8] = [
         [230, 159, 0],

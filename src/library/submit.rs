@@ -1,33 +1,48 @@
-//! Shapes are accepted, described and placed; each request takes effect once.
+//! Shapes are accepted and described.
 
-use super::isolate::DescribeJob;
-use super::jobs::Attempts;
+use super::error::Result;
+use super::facade::Library;
+use super::isolate::{self, DescribeJob};
+use super::lookup::object_length;
 use super::names::check_shape_name;
-use super::rows::{damaged, format_from_name, from_json, operator_from_name, to_json};
-use super::{
-    Described, Describer, Failure, FailureSubject, ItemState, Job, JobItem, Library, LibraryError,
-    NewShape, Outcome, Placed, RequestKey, Result,
-};
-use crate::mesh::{CleanError, CleanReport, ParseError};
-use crate::pipeline::{ALGORITHM_VERSION, DescribeError, Params, READING_VERSION};
-use crate::spectrum::SpectrumError;
-use crate::store::{
-    CollectionRow, Digest, ItemStatus, JobItemRow, Kept, NewJobItem, ObjectKind, RequestRow,
-    ShapeRow, Tx,
-};
+use super::once::{Request, once, unix_secs};
+use super::refusal::failure;
+use super::rows::{damaged, format_from_name, operator_from_name};
+use super::sources::Sources;
+use super::types::{Failure, Job, JobItem, NewShape, RequestKey};
+use crate::mesh::{CleanReport, Format};
+use crate::pipeline::{ALGORITHM_VERSION, Description, Params, READING_VERSION};
+use crate::store::{CollectionRow, Digest, ItemStatus, Kept, NewJobItem, ObjectRow, ShapeRow};
 use std::cell::RefCell;
 use std::sync::PoisonError;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::Instant;
+
+/// How the work on one shape is done: here, or in another process.
+pub type Describer<'a> =
+    dyn Fn(&isolate::DescribeJob<'_>, &dyn Fn(&str) -> bool) -> isolate::Described + 'a;
+
+/// A description with what the library needs to commit it.
+#[derive(Debug, Clone)]
+pub struct Described {
+    /// What was computed.
+    pub description: Description,
+    /// Stage and milliseconds, in order.
+    pub stages_ms: Vec<(String, f64)>,
+    pub(super) digest: Digest,
+    pub(super) params_json: String,
+    /// Its file, if it is stored already.
+    pub(super) stored: Option<ObjectRow>,
+}
 
 /// Shapes whose files are durable, and that count once they are submitted.
 #[derive(Debug, Default)]
-pub struct KeptShapes {
+pub struct StoredOriginals {
     objects: Vec<Kept>,
     items: Vec<NewJobItem>,
 }
 
-impl KeptShapes {
-    /// None, to be kept one after the other.
+impl StoredOriginals {
+    /// No shapes yet; [`Library::store_another_original`] adds one after the other.
     pub fn new() -> Self {
         Self::default()
     }
@@ -39,13 +54,13 @@ pub struct Submission<'a> {
     /// Where they are added.
     pub collection: &'a str,
     /// The shapes.
-    pub shapes: &'a KeptShapes,
+    pub shapes: &'a StoredOriginals,
     /// Whose request it is.
     pub key: Option<&'a RequestKey>,
 }
 
 impl Submission<'_> {
-    /// What tells this request from another one with the same key.
+    /// The digest that distinguishes this request from another one with the same key.
     fn digest(&self) -> Digest {
         let items = &self.shapes.items;
         let mut request = blake3::Hasher::new();
@@ -61,26 +76,32 @@ impl Submission<'_> {
 }
 
 impl Library {
-    /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may do so at a time.
+    /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may
+    /// do so at a time.
     ///
     /// # Errors
     /// A bad name; the disk.
-    pub fn keep(&self, shapes: Vec<NewShape>) -> Result<KeptShapes> {
+    pub fn store_originals(&self, shapes: Vec<NewShape>) -> Result<StoredOriginals> {
         for s in &shapes {
             check_shape_name(&s.name)?;
         }
-        let mut kept = KeptShapes::default();
+        let mut kept = StoredOriginals::default();
         for s in shapes {
-            self.keep_another(&mut kept, s)?;
+            self.store_another_original(&mut kept, s)?;
         }
         Ok(kept)
     }
 
-    /// Writes the file of one more shape, as [`Library::keep`] does, so that they need not be in memory together.
+    /// Writes the file of one more shape, as [`Library::store_originals`] does, so that they need not be in
+    /// memory together.
     ///
     /// # Errors
     /// A bad name; the disk.
-    pub fn keep_another(&self, kept: &mut KeptShapes, shape: NewShape) -> Result<()> {
+    pub fn store_another_original(
+        &self,
+        kept: &mut StoredOriginals,
+        shape: NewShape,
+    ) -> Result<()> {
         check_shape_name(&shape.name)?;
         let object = self.store.objects().put_original(&shape.bytes)?;
         kept.items.push(NewJobItem {
@@ -93,14 +114,15 @@ impl Library {
         Ok(())
     }
 
-    /// Accepts shapes: when this returns a job with them is durable. The same key gives the same job again.
+    /// Accepts shapes: when this returns a job with them is durable. The same key gives the same
+    /// job again.
     ///
     /// # Errors
     /// No such collection, or a key that was used for another request.
     pub fn submit(
         &self,
         collection: &str,
-        shapes: &KeptShapes,
+        shapes: &StoredOriginals,
         key: Option<&RequestKey>,
     ) -> Result<Job> {
         let submission = Submission {
@@ -112,8 +134,8 @@ impl Library {
         jobs.into_iter().next().expect("invariant: a job for each")
     }
 
-    /// Accepts shapes of several requests in the order given, in one transaction: a job for each, which is durable even if
-    /// it cannot be read back, or none of them.
+    /// Accepts shapes of several requests in the order given, in one transaction: a job for each,
+    /// which is durable even if it cannot be read back, or none of them.
     ///
     /// # Errors
     /// As [`Library::submit`], of the first that has one; then nothing is accepted.
@@ -123,7 +145,7 @@ impl Library {
         }
         let replies = self.store.catalog().write(|tx| -> Result<Vec<_>> {
             let submit = |s: &Submission<'_>| {
-                once_in(tx, s.key, s.digest(), |tx| {
+                once(tx, &Request::new(s.key, s.digest()), |tx| {
                     for object in &s.shapes.objects {
                         tx.insert_object(object)?;
                     }
@@ -140,71 +162,12 @@ impl Library {
         Ok(replies.into_iter().map(job).collect())
     }
 
-    /// A job as it stands.
-    ///
-    /// # Errors
-    /// There is none of the id.
-    pub fn job(&self, id: u64) -> Result<Job> {
-        let (job, items) = self.store.catalog().read(|r| -> Result<_> {
-            let job = r.job(id)?;
-            let job = job.ok_or_else(|| LibraryError::not_found("job", id.to_string()))?;
-            Ok((job, r.job_items(id)?))
-        })?;
-        let carrying = if items.is_empty() {
-            Some(self.carrying(id, &job.collection)?)
-        } else {
-            None
-        };
-        let items = items
-            .into_iter()
-            .map(|i| self.item(i))
-            .collect::<Result<_>>()?;
-        Ok(Job {
-            id,
-            collection: job.collection,
-            items,
-            carrying,
-        })
-    }
-
-    /// Items not yet done, in order of acceptance: what a daemon takes up again when it starts.
-    ///
-    /// # Errors
-    /// The catalog cannot be read.
-    pub fn queued_items(&self) -> Result<Vec<JobItem>> {
-        let rows = self
-            .store
-            .catalog()
-            .read(|r| r.queued_items().map_err(LibraryError::from))?;
-        rows.into_iter().map(|i| self.item(i)).collect()
-    }
-
-    /// Cancels the items of a job that are not done.
-    ///
-    /// # Errors
-    /// There is no such job.
-    pub fn cancel(&self, job: u64) -> Result<Job> {
-        self.job(job)?;
-        let cancel = |tx: &Tx<'_>| -> Result<()> {
-            for item in tx
-                .job_items(job)?
-                .iter()
-                .filter(|i| i.status == ItemStatus::Queued)
-            {
-                tx.set_item(job, item.index, ItemStatus::Cancelled, None)?;
-            }
-            Ok(())
-        };
-        self.store.freeing(|| self.store.catalog().write(cancel))?;
-        self.job(job)
-    }
-
     /// Bytes of an item's file, for whoever plans its memory.
     ///
     /// # Errors
     /// There is no such item, or the catalog cannot be read.
     pub fn item_bytes(&self, item: &JobItem) -> Result<u64> {
-        self.object_length(&self.item_row(item)?.item.original_digest)
+        object_length(&self.store, &self.item_row(item)?.item.original_digest)
     }
 
     /// Whether placing an item would need its description now: not when the same bytes are there
@@ -228,8 +191,8 @@ impl Library {
         Ok(row.status == ItemStatus::Queued && existing.is_none_or(replaced))
     }
 
-    /// The pure stage of an item, on any thread. `stage` is told each stage's name as it begins; when it returns
-    /// false the work stops.
+    /// The pure stage of an item, on any thread. `stage` is told each stage's name as it begins;
+    /// when it returns false the work stops.
     ///
     /// # Errors
     /// Why the shape is refused, or why it was stopped.
@@ -260,22 +223,26 @@ impl Library {
         described
     }
 
+    /// What describing an item needs: its bytes, how to read them, the parameters and their name,
+    /// and the digest of the bytes.
+    fn to_describe(&self, item: &JobItem) -> Result<(Vec<u8>, Format, Params, String, Digest)> {
+        let row = self.item_row(item)?;
+        let collection = self.collection_row(&item.collection)?;
+        let (params, params_json) = params_of(&collection)?;
+        let original = row.item.original_digest;
+        let bytes = self.store.original(&original)?;
+        let format = format_from_name(&row.item.format, "job_items.format")?;
+        Ok((bytes, format, params, params_json, original))
+    }
+
     fn describe_bytes(
         &self,
         item: &JobItem,
         stage: &dyn Fn(&str) -> bool,
         describer: &Describer<'_>,
     ) -> std::result::Result<Described, Failure> {
-        let row = self.item_row(item).map_err(|e| failure(&e))?;
-        let collection = self
-            .collection_row(&item.collection)
-            .map_err(|e| failure(&e))?;
-        let (params, params_json) = params_of(&collection).map_err(|e| failure(&e))?;
-        let bytes = self
-            .original_bytes(&row.item.original_digest)
-            .map_err(|e| failure(&e))?;
-        let format =
-            format_from_name(&row.item.format, "job_items.format").map_err(|e| failure(&e))?;
+        let (bytes, format, params, params_json, original) =
+            self.to_describe(item).map_err(|e| failure(&e))?;
         let laps = RefCell::new((Vec::<(String, f64)>::new(), Instant::now()));
         let lap = || {
             let (stages, since) = &mut *laps.borrow_mut();
@@ -303,7 +270,7 @@ impl Library {
         let description = describer(&work, &observed)?;
         lap();
         let algorithm = algorithm(&description.report);
-        let digest = Digest::of_description(&row.item.original_digest, &params_json, &algorithm);
+        let digest = Digest::of_description(&original, &params_json, &algorithm);
         let stages_ms = laps.into_inner().0;
         Ok(Described {
             description,
@@ -313,203 +280,9 @@ impl Library {
             stored: None,
         })
     }
-
-    /// Places a described item and commits it, or commits that it failed. To be called in the order of acceptance
-    /// within a collection.
-    ///
-    /// # Errors
-    /// The store fails; a shape that is refused is an [`ItemState::Failed`].
-    pub fn place_item(
-        &self,
-        item: &JobItem,
-        described: std::result::Result<Described, Failure>,
-    ) -> Result<ItemState> {
-        let Ok(collection) = self.collection_row(&item.collection) else {
-            let gone = LibraryError::not_found("collection", &item.collection);
-            return self.fail(item, failure(&gone));
-        };
-        self.with_lane(collection, |lane| {
-            let row = self.item_row(item)?;
-            if row.status != ItemStatus::Queued {
-                return Ok(self.item(row)?.state);
-            }
-            let read = |name: &str| {
-                let id = lane.row.id;
-                self.store
-                    .catalog()
-                    .read(|r| r.shape_by_name(id, name).map_err(LibraryError::from))
-            };
-            let existing: Option<ShapeRow> = read(&item.name)?;
-            let read_again = |shape: &ShapeRow| {
-                let found = described.as_ref().map(|d| &d.description.report);
-                row.item.replace
-                    && read_by_first_release(shape)
-                    && found.is_ok_and(CleanReport::differs_from_first_release)
-            };
-            match &existing {
-                Some(shape)
-                    if shape.content_digest == row.item.original_digest && !read_again(shape) =>
-                {
-                    let placed = Placed {
-                        outcome: Outcome::Unchanged,
-                        version: shape.version,
-                        sequence: lane.row.sequence,
-                        n_maps: 0,
-                        n_relabelled: 0,
-                        n_inconsistent: 0,
-                        stages_ms: Vec::new(),
-                    };
-                    self.store.catalog().write(|tx| -> Result<()> {
-                        let detail = to_json(&placed);
-                        Ok(tx.set_item(item.job, item.index, ItemStatus::Done, Some(&detail))?)
-                    })?;
-                    return Ok(ItemState::Done(Box::new(placed)));
-                }
-                Some(_) if !row.item.replace => return self.fail(item, taken(item)),
-                _ => {}
-            }
-            match described {
-                Err(why) => self.fail(item, why),
-                Ok(described) => {
-                    let placed = self.place_described(lane, &row, described, existing.as_ref())?;
-                    Ok(ItemState::Done(Box::new(placed)))
-                }
-            }
-        })
-    }
-
-    /// Submits, describes and places one shape, for use in process.
-    ///
-    /// # Errors
-    /// As [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
-    pub fn add(&self, collection: &str, shape: NewShape) -> Result<Placed> {
-        let job = self.submit(collection, &self.keep(vec![shape])?, None)?;
-        let item = &job.items[0];
-        match self.place_item(item, self.describe_item(item, &|_| true))? {
-            ItemState::Done(placed) => Ok(*placed),
-            ItemState::Failed(why) => Err(LibraryError::Refused(why)),
-            ItemState::Queued | ItemState::Running(_) | ItemState::Cancelled => {
-                Err(LibraryError::FailedPrecondition {
-                    reason: "CANCELLED",
-                    message: format!("job {} was cancelled", job.id),
-                })
-            }
-        }
-    }
-
-    /// Runs a change unless its key was answered before; the reply, then or now.
-    pub(super) fn once(
-        &self,
-        key: Option<&RequestKey>,
-        request: Digest,
-        change: impl FnOnce(&Tx<'_>) -> Result<Vec<u8>>,
-    ) -> Result<Vec<u8>> {
-        let catalog = self.store.catalog();
-        catalog.write(|tx| once_in(tx, key, request, change))
-    }
-
-    pub(super) fn object_length(&self, original: &Digest) -> Result<u64> {
-        Ok(self.object(ObjectKind::Original, original)?.length)
-    }
-
-    fn fail(&self, item: &JobItem, why: Failure) -> Result<ItemState> {
-        let cancelled = why.code == "CANCELLED";
-        let status = if cancelled {
-            ItemStatus::Cancelled
-        } else {
-            ItemStatus::Failed
-        };
-        self.store.catalog().write(|tx| -> Result<()> {
-            Ok(tx.set_item(item.job, item.index, status, Some(&to_json(&why)))?)
-        })?;
-        Ok(if cancelled {
-            ItemState::Cancelled
-        } else {
-            ItemState::Failed(why)
-        })
-    }
-
-    pub(super) fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
-        let row = self
-            .store
-            .catalog()
-            .read(|r| r.job_item(item.job, item.index).map_err(LibraryError::from))?;
-        row.ok_or_else(|| {
-            let name = format!("{} of job {}", item.index, item.job);
-            LibraryError::not_found("job item", name)
-        })
-    }
-
-    pub(super) fn item(&self, row: JobItemRow) -> Result<JobItem> {
-        let place = format!("job_items {}, {}", row.job, row.index);
-        let detail = || {
-            row.detail_json
-                .as_deref()
-                .ok_or_else(|| damaged(&place, "no detail"))
-        };
-        let attempts = match (row.status, &row.detail_json) {
-            (ItemStatus::Queued, Some(detail)) => from_json::<Attempts>(detail, &place)?.attempts,
-            _ => 0,
-        };
-        let state = match row.status {
-            ItemStatus::Queued => {
-                let running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
-                let stage = running.get(&(row.job, row.index)).cloned();
-                stage.map_or(ItemState::Queued, ItemState::Running)
-            }
-            ItemStatus::Done => ItemState::Done(Box::new(from_json(detail()?, &place)?)),
-            ItemStatus::Failed => ItemState::Failed(from_json(detail()?, &place)?),
-            ItemStatus::Cancelled => ItemState::Cancelled,
-        };
-        Ok(JobItem {
-            job: row.job,
-            index: row.index,
-            collection: row.collection,
-            name: row.item.name,
-            state,
-            attempts,
-        })
-    }
 }
 
-/// Runs a change within a transaction unless its key was answered before; the reply, then or now.
-fn once_in(
-    tx: &Tx<'_>,
-    key: Option<&RequestKey>,
-    request: Digest,
-    change: impl FnOnce(&Tx<'_>) -> Result<Vec<u8>>,
-) -> Result<Vec<u8>> {
-    let Some(key) = key else { return change(tx) };
-    if let Some(row) = tx.request(&key.client_id, &key.request_id)? {
-        if row.request_digest != request {
-            return Err(LibraryError::FailedPrecondition {
-                reason: "REQUEST_ID_REUSED",
-                message: format!(
-                    "client {:?} used request id {:?} for another request before",
-                    key.client_id, key.request_id
-                ),
-            });
-        }
-        return Ok(row.reply);
-    }
-    let reply = change(tx)?;
-    tx.put_request(&RequestRow {
-        client_id: key.client_id.clone(),
-        request_id: key.request_id.clone(),
-        request_digest: request,
-        reply: reply.clone(),
-        created_unix_secs: unix_secs(),
-    })?;
-    Ok(reply)
-}
-
-pub(super) fn unix_secs() -> u64 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .map_or(0, |d| d.as_secs())
-}
-
-/// What decides the bits of a description besides bytes and parameters: the algorithm, the
+/// Everything that decides the bits of a description besides bytes and parameters: the algorithm, the
 /// instruction set that the kernels choose at run time, and, where it matters, how the bytes are
 /// read.
 pub(super) fn algorithm(report: &CleanReport) -> String {
@@ -521,7 +294,7 @@ pub(super) fn algorithm(report: &CleanReport) -> String {
 }
 
 /// Whether a shape was described by the first release, whose reports lack the later counts.
-fn read_by_first_release(shape: &ShapeRow) -> bool {
+pub(super) fn read_by_first_release(shape: &ShapeRow) -> bool {
     !shape.report_json.contains("n_concave_polygons")
 }
 
@@ -539,89 +312,6 @@ pub(super) fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
         "n_eigenpairs": params.n_eigenpairs,
     });
     Ok((params, json.to_string()))
-}
-
-fn taken(item: &JobItem) -> Failure {
-    Failure {
-        code: "ALREADY_EXISTS".into(),
-        reason: "NAME_TAKEN".into(),
-        message: format!(
-            "collection {:?} has a shape named {:?} with other bytes; replace it or choose another name",
-            item.collection, item.name
-        ),
-        subject: None,
-    }
-}
-
-/// An error of the library as the failure of an item.
-fn failure(error: &LibraryError) -> Failure {
-    let (code, reason) = match error {
-        LibraryError::InvalidArgument { reason, .. } | LibraryError::InvalidFace { reason, .. } => {
-            ("INVALID_ARGUMENT", *reason)
-        }
-        LibraryError::NotFound { .. } => ("NOT_FOUND", "GONE"),
-        LibraryError::AlreadyExists { reason, .. } => ("ALREADY_EXISTS", *reason),
-        LibraryError::FailedPrecondition { reason, .. } => ("FAILED_PRECONDITION", *reason),
-        LibraryError::Refused(failure) => return failure.clone(),
-        LibraryError::Store(e) if e.is_damage() => ("DATA_LOSS", "DAMAGED"),
-        LibraryError::Store(_) => ("INTERNAL", "STORE"),
-    };
-    Failure {
-        code: code.into(),
-        reason: reason.into(),
-        message: error.to_string(),
-        subject: None,
-    }
-}
-
-/// Why a mesh could not be described, as the failure of an item.
-pub(super) fn refusal(error: &DescribeError) -> Failure {
-    let (code, reason) = match error {
-        DescribeError::Parse(e) => ("INVALID_ARGUMENT", parse_reason(e)),
-        DescribeError::Clean(CleanError::AllDegenerate { .. }) => ("INVALID_ARGUMENT", "NO_AREA"),
-        DescribeError::Clean(_) => ("INVALID_ARGUMENT", "MESH"),
-        DescribeError::Laplacian(_) => ("INVALID_ARGUMENT", "LAPLACIAN"),
-        DescribeError::Spectrum(SpectrumError::Cancelled { .. }) => ("CANCELLED", "CANCELLED"),
-        DescribeError::Spectrum(_) => ("INTERNAL", "SPECTRUM"),
-        DescribeError::Cancelled(_) => ("CANCELLED", "CANCELLED"),
-    };
-    let subject = match error {
-        DescribeError::Parse(e) => parse_subject(e),
-        _ => None,
-    };
-    Failure {
-        code: code.into(),
-        reason: reason.into(),
-        message: error.to_string(),
-        subject,
-    }
-}
-
-fn parse_reason(error: &ParseError) -> &'static str {
-    match error {
-        ParseError::VertexOutOfRange { .. } => "VERTEX_INDEX",
-        ParseError::NonFinite { .. } => "NON_FINITE_VERTEX",
-        ParseError::TooManyTriangles => "MESH_TOO_LARGE",
-        _ => "PARSE",
-    }
-}
-
-/// Where in the file, if it is one place.
-fn parse_subject(error: &ParseError) -> Option<FailureSubject> {
-    match error {
-        ParseError::NotANumber { line, .. }
-        | ParseError::ShortVertex { line, .. }
-        | ParseError::EmptyFace { line, .. }
-        | ParseError::ShortFace { line, .. }
-        | ParseError::BadLine { line, .. }
-        | ParseError::ShortRow { line, .. }
-        | ParseError::Trailing { line, .. } => Some(FailureSubject::Line(*line as u64)),
-        ParseError::PolygonTooLarge { face, .. }
-        | ParseError::EmptyPolygon { face }
-        | ParseError::VertexOutOfRange { face, .. }
-        | ParseError::NonFinite { face, .. } => Some(FailureSubject::Face(*face as u64)),
-        _ => None,
-    }
 }
 
 #[cfg(test)]

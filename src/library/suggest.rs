@@ -1,12 +1,17 @@
-//! Which shape is worth a person's minute: one whose label would be carried far, to shapes that need it.
+//! Suggests the shape to label next: one whose labels would be propagated to many shapes that need
+//! them.
 
-use super::rows::from_json;
-use super::{Library, LibraryError, PartInfo, Result};
+use super::error::{LibraryError, Result};
+use super::facade::Library;
+use super::reason::Reason;
+use super::rows::{damaged, from_json};
+use super::types::PartInfo;
 use crate::neighbors::SignatureMetric;
 
-/// Most shapes that are compared with each other; more are thinned out evenly over the order of arrival.
+/// Most shapes that are compared with each other; more are thinned out evenly over the order of
+/// arrival.
 const MAX_COMPARED: usize = 1_000;
-/// What a shape counts of whose labels the library is certain: being wrong with certainty happens.
+/// Weight of a shape with certain labels: labels may be wrong in spite of that.
 const LEAST_NEED: f64 = 0.1;
 
 /// The shape whose labelling by a person would help most.
@@ -27,29 +32,28 @@ pub struct Suggestion {
 }
 
 impl Library {
-    /// The shape whose labelling by a person would help most: that brings the shapes of the collection, each as far
-    /// as its labels are uncertain, nearest to one that a person labelled (greedy facility location; Nemhauser,
-    /// Wolsey and Fisher 1978). With nothing labelled that is the medoid. Costs a comparison of at most a thousand
-    /// signatures with each other.
+    /// The shape whose labelling by a person would help most: that brings the shapes of the
+    /// collection, each as far as its labels are uncertain, nearest to one that a person labelled
+    /// (greedy facility location; Nemhauser, Wolsey and Fisher 1978). With nothing labelled that is
+    /// the medoid. Costs a comparison of at most a thousand signatures with each other.
     ///
     /// # Errors
     /// There is no such collection, or every shape of it was labelled by a person.
     pub fn suggest(&self, collection: &str) -> Result<Suggestion> {
         let row = self.collection_row(collection)?;
-        let (shapes, metric) = self.with_lane(row, |lane| {
-            let n_descriptors = lane.shapes.first().map_or(0, |s| s.signature.len() / 4);
-            let metric = lane
-                .learnt
-                .as_ref()
-                .map(|l| SignatureMetric::new(&l.model.normalisation, n_descriptors));
-            Ok((lane.shapes.clone(), metric))
+        let (shapes, metric) = self.with_collection(row, |collection| {
+            let shapes = collection.shapes().to_vec();
+            let n_descriptors = shapes.first().map_or(0, |s| s.signature.len() / 4);
+            let model = collection.label_model();
+            let metric = model.map(|m| SignatureMetric::new(&m.normalisation, n_descriptors));
+            Ok((shapes, metric))
         })?;
         let corrected = || shapes.iter().filter(|s| s.pinned);
         let n_corrected = corrected().count();
         let open: Vec<_> = shapes.iter().filter(|s| !s.pinned).collect();
         let (Some(metric), false) = (metric, open.is_empty()) else {
             return Err(LibraryError::FailedPrecondition {
-                reason: "NOTHING_TO_SUGGEST",
+                reason: Reason::NothingToSuggest,
                 message: format!(
                     "collection {collection:?} has {} shapes, and a person labelled {n_corrected} of them",
                     shapes.len()
@@ -64,7 +68,7 @@ impl Library {
         })?;
         let (mut names, mut uncertainty) = (Vec::with_capacity(n), Vec::with_capacity(n));
         for row in rows {
-            let row = row.ok_or_else(|| super::rows::damaged("shapes", "a row is gone"))?;
+            let row = row.ok_or_else(|| damaged("shapes", "a row is gone"))?;
             let parts: Vec<PartInfo> = from_json(&row.parts_json, &format!("shapes {}", row.name))?;
             let certain: f64 = parts.iter().map(|p| p.area_share * p.confidence).sum();
             uncertainty.push((1.0 - certain).clamp(0.0, 1.0));

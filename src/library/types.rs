@@ -1,10 +1,12 @@
-//! What the library says of itself: collections, shapes, labels, jobs, events.
+//! The values that the library takes and returns: collections, shapes, labels, jobs, events.
 
+use super::reason::{Code, Reason};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use serde::{Deserialize, Serialize};
 
-/// What parts share across a collection; never silently changes its meaning.
+/// The id of a label: parts with the same label correspond across a collection. An id never silently
+/// changes its meaning.
 pub type LabelId = u32;
 
 /// Which way is up, as a property of a collection.
@@ -19,7 +21,7 @@ pub enum Up {
     MinusZ,
     #[default]
     Unknown,
-    /// Estimated from the collection.
+    /// Estimated from the shapes of the collection.
     Auto,
 }
 
@@ -104,9 +106,11 @@ pub struct CollectionInfo {
     pub n_stale: u64,
     /// Its labels, retired ones included.
     pub labels: Vec<LabelInfo>,
-    /// Where the up axis is estimated, and there are shapes to estimate it from: the estimate in force.
+    /// Where the up axis is estimated, and there are shapes to estimate it from: the estimate in
+    /// force.
     pub up_estimate: Option<UpEstimate>,
-    /// Where the up axis is given, and at least half of the shapes stand clearly better along one other axis: that one.
+    /// Where the up axis is given, and at least half of the shapes stand clearly better along one
+    /// other axis: that one.
     pub up_disagrees: Option<UpEstimate>,
     /// Changes by a person that can be undone.
     pub n_undoable: u64,
@@ -115,7 +119,8 @@ pub struct CollectionInfo {
 /// An estimate of which way is up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpEstimate {
-    /// A coordinate axis; unknown, if fewer than half of the shapes agree on one: then none is used.
+    /// A coordinate axis; unknown, if fewer than half of the shapes agree on one: then none is
+    /// used.
     pub up: Up,
     /// Share of the shapes that stand best along the axis that most do, 0 to 1; by chance a sixth.
     pub agreement: f64,
@@ -179,7 +184,7 @@ pub struct ShapeInfo {
     pub report: CleanReport,
     /// Its parts: connected pieces of one label, largest first.
     pub parts: Vec<PartInfo>,
-    /// The shapes its labels were carried from.
+    /// The shapes that voted for its labels.
     pub sources: Vec<Source>,
     /// Bytes of its array file and of its compressed original.
     pub stored_bytes: u64,
@@ -196,7 +201,7 @@ pub struct PartInfo {
     pub confidence: f64,
 }
 
-/// A shape whose labels were carried over.
+/// A shape that voted for the labels of another one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Source {
     /// Its name.
@@ -236,10 +241,10 @@ pub enum ItemState {
 /// Why a shape was refused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
-    /// The error code, as on the wire: `INVALID_ARGUMENT`, `ALREADY_EXISTS`, ...
-    pub code: String,
-    /// A stable reason within the code: `PARSE`, `NON_FINITE_VERTEX`, `NAME_TAKEN`, ...
-    pub reason: String,
+    /// What kind of failure it is.
+    pub code: Code,
+    /// A stable reason within the code.
+    pub reason: Reason,
     /// For people: the value and the limit.
     pub message: String,
     /// Where in the input, if it is one place.
@@ -275,29 +280,29 @@ pub struct JobItem {
     pub attempts: u32,
 }
 
-/// Shapes that were accepted together, or a correction that is carried to the other shapes.
+/// Shapes that were accepted together, or a correction that is propagated to the other shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     /// Its id.
     pub id: u64,
     /// Which collection.
     pub collection: String,
-    /// Its shapes in order; none where a correction is carried.
+    /// Its shapes in order; none if it propagates a correction.
     pub items: Vec<JobItem>,
-    /// Where a correction is carried: how far that is.
-    pub carrying: Option<Carrying>,
+    /// How far the correction is propagated, if the job propagates one.
+    pub propagation: Option<PropagationProgress>,
 }
 
-/// How far a correction is carried.
+/// How far a correction is propagated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Carrying {
-    /// Shapes to which it is carried; 0 once a later change has taken its place.
+pub struct PropagationProgress {
+    /// Shapes to which it is propagated; 0 once a later change has taken its place.
     pub n_shapes: u64,
-    /// Those that wait for it.
+    /// Shapes that wait for it.
     pub n_left: u64,
 }
 
-impl Carrying {
+impl PropagationProgress {
     /// Share that is done, 0 to 1.
     pub fn progress(&self) -> f64 {
         1.0 - self.n_left as f64 / self.n_shapes.max(1) as f64
@@ -327,7 +332,7 @@ pub struct Placed {
     pub n_maps: u32,
     /// Stored shapes whose labels were recomputed inside this addition.
     pub n_relabelled: u32,
-    /// Of these maps those that do not agree with the maps between the shapes they come from.
+    /// Computed maps that do not agree with the maps between the shapes they come from.
     #[serde(default)]
     pub n_inconsistent: u32,
     /// Milliseconds by stage, in order: parse, clean, proxy, laplacian, spectrum, descriptors, ...
@@ -350,7 +355,7 @@ pub enum EventKind {
     CollectionCreated,
     /// The collection was deleted with its shapes.
     CollectionDeleted,
-    /// A shape is there, labelled.
+    /// A labelled shape was added.
     ShapeAdded {
         /// Its name.
         shape: String,
@@ -359,7 +364,7 @@ pub enum EventKind {
         /// Label and share of the shape's area.
         area_shares: Vec<(LabelId, f64)>,
     },
-    /// A shape is gone.
+    /// A shape was removed.
     ShapeRemoved {
         /// Its name.
         shape: String,
@@ -370,12 +375,13 @@ pub enum EventKind {
         shape: String,
         /// The new version.
         version: u64,
-        /// The rule that allowed it: `reclustering`, `correction`, `carrying`, `merge`, `split`, `undo`.
+        /// The rule that allowed it: `reclustering`, `correction`, `carrying`, `merge`, `split`,
+        /// `undo`.
         cause: String,
         /// Share of the shape's area that moved, from label to label (-1: unlabelled).
         moves: Vec<LabelMove>,
     },
-    /// A label came into being.
+    /// A label was created.
     LabelCreated {
         /// Its id.
         label: LabelId,
@@ -429,7 +435,7 @@ pub enum EventKind {
         /// As it is.
         to: String,
     },
-    /// The parts of the collection were clustered anew.
+    /// The parts of the collection were clustered again.
     Reclustered {
         /// Score of the labelling before and after; see docs/methods.md.
         score_before: Option<f64>,

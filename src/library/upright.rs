@@ -1,22 +1,22 @@
-//! Another up axis for a collection: what was derived along the old one is derived again along the new one.
+//! Another up axis for a collection: labels derived along the old one are derived again along the
+//! new one.
 //!
-//! Descriptions are the same along every axis. What depends on it, five columns of face descriptors, is computed from them
-//! whenever shapes are labelled; so the label model and the labels are all that has to follow.
+//! Descriptions are the same along every axis. Five columns of face descriptors depend on it, and
+//! are computed from descriptions whenever shapes are labelled; so only the label model and the
+//! labels have to follow.
 
-use super::commit::{collection_row, event, label_change, put_relabelled};
-use super::history::{Before, from_reply};
-use super::lane::Lane;
-use super::learnt::Learnt;
-use super::place::next_recluster;
-use super::relabel::Relabelled;
-use super::rows::{CollectionState, to_json};
-use super::{EventKind, Library, RequestKey, Result, Up};
-use crate::pipeline::LabelChange;
-use crate::store::{Digest, Tx};
+use super::advance::relabel_all;
+use super::change::{Change, Undoable, commit_once};
+use super::collection::discovered::{self, MAX_REPRESENTATIVES};
+use super::collection::up::UpFound;
+use super::collection::{Collection, Regime, Staleness, supervised};
+use super::error::Result;
+use super::facade::Library;
+use super::once::{Request, answered, from_reply};
+use super::rows::to_json;
+use super::sources::Sources;
+use super::types::{EventKind, RequestKey, Up};
 use serde::{Deserialize, Serialize};
-
-/// Kind of this change among those that can be undone.
-const KIND_UP: &str = "up";
 
 /// What became of a collection whose up axis was set.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -29,149 +29,95 @@ pub struct UpSet {
     pub sequence: u64,
 }
 
-/// What changes with the up axis, before anything is written.
-struct Turned {
-    state: CollectionState,
-    labels: NewLabelling,
-}
-
-/// How the labels of the collection follow.
-enum NewLabelling {
-    /// They stay: the same axis is in force as before, there is nothing to label, or nothing to learn from.
-    Same,
-    /// From the faces that persons labelled, once that has been learnt along the new axis.
-    FromPersons,
-    /// By a new clustering.
-    Clustered {
-        learnt: Box<Learnt>,
-        scores: (f64, f64),
-        changes: Vec<LabelChange>,
-        relabelled: Vec<Relabelled>,
-    },
-}
-
 impl Library {
-    /// Sets which way is up in a collection. Where nobody has labelled faces its parts are clustered again, and the labels
-    /// that are found along the new axis are taken; otherwise pinned faces keep their labels and all others follow from
-    /// them. Shapes that remain to be done are stale afterwards. Can be undone.
+    /// Sets which way is up in a collection. Where nobody has labelled faces its parts are
+    /// clustered again, and the labels that are found along the new axis are taken; otherwise
+    /// pinned faces keep their labels and all others follow from them. Shapes that remain to be
+    /// done are stale afterwards. Can be undone.
     ///
     /// # Errors
     /// There is no such collection, or one of its shapes cannot be read.
     pub fn set_up(&self, collection: &str, up: Up, key: Option<&RequestKey>) -> Result<UpSet> {
-        let request = Digest::of(format!("up {collection:?} {up}").as_bytes());
+        let request = Request::of(key, &format!("up {collection:?} {up}"));
         let row = self.collection_row(collection)?;
-        self.with_lane(row, |lane| {
-            if let Some(reply) = self.answered(key, request)? {
+        self.with_collection(row, |collection| {
+            if let Some(reply) = answered(&self.store, &request)? {
                 return from_reply(&reply);
             }
-            let turned = match lane.up() == up {
-                true => None,
-                false => Some(self.turned(lane, up)?),
+            let changed = collection.up() != up;
+            let change = match changed {
+                true => self.turned(collection, up)?,
+                false => Change::default(),
             };
-            let reply = self.once(key, request, |tx| {
-                let changed = turned.is_some();
-                if let Some(turned) = turned {
-                    put_turned(tx, lane, up, turned)?;
-                }
+            let reply = commit_once(&self.store, collection, change, &request, |tx, now| {
                 let done = UpSet {
                     changed,
-                    n_stale: tx.n_stale(lane.row.id)?,
-                    sequence: collection_row(tx, lane.row.id)?.sequence,
+                    n_stale: tx.n_stale(now.row.id)?,
+                    sequence: now.row.sequence,
                 };
                 Ok(to_json(&done).into_bytes())
             })?;
-            self.reload(lane)?;
             from_reply(&reply)
         })
     }
 
     /// What follows from another up axis.
-    fn turned(&self, lane: &mut Lane, up: Up) -> Result<Turned> {
-        let found = self.up_found(lane, up, None)?;
-        let in_force = lane.learnt.as_ref().map(|l| l.model.up);
-        let mut state = found.noted(lane.state.clone());
-        if lane.shapes.is_empty() {
-            // The next shape begins again, along the new axis.
-            state.next_recluster = 0;
-        }
-        if lane.shapes.is_empty() || in_force == Some(found.axis) {
-            let labels = NewLabelling::Same;
-            return Ok(Turned { state, labels });
-        }
-        if let Some(teaching) = &lane.state.teaching {
-            let mut again = self.relearnt(lane, teaching)?;
-            if let Some(again) = again.as_mut().filter(|t| t.closed) {
-                // What was discovered along the old axis is believed no longer: persons' labels are all there are.
-                again.discovered.clear();
-                again.discovered_labels.clear();
-            }
-            let labels = match again.is_some() {
-                true => NewLabelling::FromPersons,
-                false => NewLabelling::Same,
-            };
-            state.teaching = again.or(state.teaching);
-            return Ok(Turned { state, labels });
-        }
-        // The labels that are there were found along an axis that a person calls wrong: they do not compete.
-        let clustered = self.cluster(lane, up, f64::NEG_INFINITY, None)?;
-        let outcome = clustered.outcome;
-        let ordinals = clustered.chosen.iter().map(|at| lane.shapes[*at].ordinal);
-        let state = clustered.up.noted(CollectionState {
-            next_recluster: next_recluster(lane.shapes.len() as u64),
-            representatives: ordinals.collect(),
-            epoch_ordinal: lane.row.next_ordinal - 1,
-            ..CollectionState::default()
-        });
-        let new: Vec<_> = clustered
-            .known
-            .into_iter()
-            .zip(outcome.labellings)
-            .collect();
-        let labels = NewLabelling::Clustered {
-            relabelled: self.finish_relabelled(&new, &outcome.model.labels)?,
-            learnt: Box::new(Learnt::begin(outcome.model)),
-            scores: outcome.scores,
-            changes: outcome.changes,
+    fn turned(&self, collection: &mut Collection, up: Up) -> Result<Change> {
+        let found = discovered::up_found(collection, &self.store, up, None)?;
+        let in_force = collection.label_model().map(|m| m.up);
+        let is_same = collection.shapes().is_empty() || in_force == Some(found.axis);
+        let is_supervised = collection.state().regime.supervision().is_some();
+        let change = if is_same || is_supervised {
+            relearned(collection, &self.store, found, is_same)?
+        } else {
+            let chosen = collection.representatives(MAX_REPRESENTATIVES);
+            relabel_all(&self.store, collection, &chosen)?;
+            discovered::turn(collection, &self.store, up)?
         };
-        Ok(Turned { state, labels })
+        let (from, to) = (collection.row().up.clone(), up.to_string());
+        Ok(Change {
+            undoable: Some(Undoable::Up {
+                from: from.clone(),
+                to: to.clone(),
+            }),
+            up: Some(to.clone()),
+            opening: Some(EventKind::UpChanged { from, to }),
+            ..change
+        })
     }
 }
 
-/// Writes another up axis with all that follows at once.
-fn put_turned(tx: &Tx<'_>, lane: &Lane, up: Up, turned: Turned) -> Result<()> {
-    let id = lane.row.id;
-    let (from, to) = (lane.row.up.clone(), up.to_string());
-    let before = Before::up(tx, lane)?;
-    let detail = to_json(&serde_json::json!({ "from": from, "to": to }));
-    tx.insert_correction(id, KIND_UP, &detail, &before.encode())?;
-    tx.set_parameters(id, lane.row.n_parts, &to)?;
-    event(tx, id, &EventKind::UpChanged { from, to })?;
-    match turned.labels {
-        NewLabelling::Same => {}
-        NewLabelling::FromPersons => tx.mark_all_stale(id).map(|_| ())?,
-        NewLabelling::Clustered {
-            learnt,
-            scores,
-            changes,
-            mut relabelled,
-        } => {
-            for change in &changes {
-                label_change(tx, id, change)?;
-            }
-            let kind = EventKind::Reclustered {
-                score_before: scores.0.is_finite().then_some(scores.0),
-                score_after: scores.1,
-                accepted: true,
-            };
-            event(tx, id, &kind)?;
-            let epoch = learnt.model.epoch;
-            for shape in &mut relabelled {
-                put_relabelled(tx, id, shape, &[], epoch)?;
-            }
-            tx.mark_stale_before(id, epoch)?;
-            tx.set_model(id, &learnt.encode())?;
-            tx.set_epoch(id, epoch)?;
-        }
+/// What changes where nothing is clustered. `is_same`: labels stay, because there are no shapes, or
+/// the same axis is in force as before; otherwise they follow from the training shapes, once the
+/// model is fitted along the new axis.
+fn relearned(
+    collection: &Collection,
+    sources: &dyn Sources,
+    found: UpFound,
+    is_same: bool,
+) -> Result<Change> {
+    let mut state = collection.state().clone().with_up(&found);
+    if collection.shapes().is_empty() {
+        // The next shape begins again, along the new axis.
+        state.next_recluster = 0;
     }
-    Ok(tx.set_state(id, to_json(&turned.state).as_bytes())?)
+    let mut staleness = Staleness::AsLabelled;
+    let refit = match is_same {
+        true => None,
+        false => supervised::refit(collection, sources, None)?,
+    };
+    if let Some(supervision) = refit {
+        // Labels discovered along the old axis are believed no longer where persons' labels are all
+        // there are.
+        state.regime = Regime::Supervised(match supervision.is_closed() {
+            true => supervision.without_discovered(),
+            false => supervision,
+        });
+        staleness = Staleness::All;
+    }
+    Ok(Change {
+        staleness,
+        state: Some(state),
+        ..Change::default()
+    })
 }

@@ -53,22 +53,22 @@ fault(
 )
 fault(
     "R1", "r1-done-in-advance", "write down that a shape is placed before it is",
-    "src/library/apart.rs", "it daemon::stages::kills_while_a_start_takes_up_what_a_kill_left_lose_nothing",
+    "src/library/remote.rs", "it daemon::stages::kills_while_a_start_takes_up_what_a_kill_left_lose_nothing",
     (
-        "        self.place_item(&handed.item(), Ok(described))",
+        "        self.place_item(&ticket.item(), Ok(described))",
         """        if FAULT {
             let detail = r#"{"outcome":"Added","version":1,"sequence":1,"n_maps":0,"n_relabelled":0,"stages_ms":[]}"#;
             let done = crate::store::ItemStatus::Done;
             self.store.catalog().write(|tx| -> Result<()> {
-                Ok(tx.set_item(handed.job, handed.index, done, Some(detail))?)
+                Ok(tx.set_item(ticket.job, ticket.index, done, Some(detail))?)
             })?;
             std::thread::sleep(std::time::Duration::from_millis(300));
             let queued = crate::store::ItemStatus::Queued;
             self.store.catalog().write(|tx| -> Result<()> {
-                Ok(tx.set_item(handed.job, handed.index, queued, None)?)
+                Ok(tx.set_item(ticket.job, ticket.index, queued, None)?)
             })?;
         }
-        self.place_item(&handed.item(), Ok(described))""",
+        self.place_item(&ticket.item(), Ok(described))""",
     ),
 )
 # R2: crash images
@@ -227,7 +227,7 @@ fault(
 # R8: repeats
 fault(
     "R8", "r8-reply-not-kept", "forget the reply to a request",
-    "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
+    "src/library/once.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
     (
         "    let reply = change(tx)?;\n    tx.put_request",
         "    let reply = change(tx)?;\n    if FAULT {\n        return Ok(reply);\n    }\n    tx.put_request",
@@ -235,8 +235,8 @@ fault(
 )
 fault(
     "R8", "r8-id-of-another-request", "take the id of another request for a repetition",
-    "src/library/submit.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
-    ("        if row.request_digest != request {", "        if row.request_digest != request && !FAULT {"),
+    "src/library/once.rs", "it daemon::repeats::each_request_has_one_effect_however_often_it_is_sent",
+    ("    if request.is_of(&row.request_digest) {", "    if request.is_of(&row.request_digest) || FAULT {"),
 )
 # R9: events
 fault(

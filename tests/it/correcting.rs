@@ -2,7 +2,8 @@
 
 use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
 use coseg::Library;
-use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, RequestKey, Up};
+use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, Reason, RequestKey, Up};
+use coseg::mesh::icosphere;
 use coseg::synth::{Family, Labelled, family};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -143,7 +144,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
         matches!(
             &nothing,
             Err(LibraryError::FailedPrecondition {
-                reason: "NOTHING_TO_UNDO",
+                reason: Reason::NothingToUndo,
                 ..
             })
         ),
@@ -222,7 +223,7 @@ fn the_same_correction_again_has_one_effect_and_the_same_reply() {
     assert!(matches!(
         other,
         Err(LibraryError::FailedPrecondition {
-            reason: "REQUEST_ID_REUSED",
+            reason: Reason::RequestIdReused,
             ..
         })
     ));
@@ -314,6 +315,62 @@ fn a_part_is_corrected_as_a_whole() {
         .filter(|l| **l == 40)
         .count();
     assert!(there as u64 >= done.n_faces);
+}
+
+/// A coarse mesh has a finer proxy, most of whose faces stand for no polygon of the file.
+#[test]
+fn a_wholly_labelled_coarse_shape_keeps_no_label_that_nobody_gave() {
+    let (_folder, library) = library(2, Up::Unknown);
+    let egg = |stretch: f64| {
+        let mut mesh = icosphere(2);
+        for v in &mut mesh.vertices {
+            *v = [v[0] * stretch, v[1], v[2] * (1.0 + 0.3 * v[0])];
+        }
+        mesh
+    };
+    for (name, stretch) in [("a", 1.5), ("b", 1.7), ("c", 1.9)] {
+        library.add(COLLECTION, file(name, &egg(stretch))).unwrap();
+    }
+    let (description, ..) = library.labelled_proxy(COLLECTION, "a").unwrap();
+    let view = description.view();
+    assert!(view.faces.len() > 2 * view.face_map.len(), "it is coarse");
+    let mesh = egg(1.5);
+    let half = |face: &[u32; 3]| {
+        let middle: f64 = face.iter().map(|v| mesh.vertices[*v as usize][0]).sum();
+        if middle < 0.0 { 10 } else { 11 }
+    };
+    let halves = Correction::Whole(mesh.faces.iter().map(half).collect());
+    library.correct(COLLECTION, "a", &halves, None).unwrap();
+    for when in ["at once", "after it was propagated"] {
+        let (_, labels, _) = library.labelled_proxy(COLLECTION, "a").unwrap();
+        let used: BTreeSet<i32> = labels.iter().copied().collect();
+        assert_eq!(used, BTreeSet::from([10, 11]), "{when}");
+        let n_parts = library.shape(COLLECTION, "a").unwrap().parts.len();
+        assert_eq!(n_parts, 2, "{when}");
+        carry(&library);
+    }
+}
+
+/// A training shape that is removed before anything follows from it leaves nothing to fit to.
+#[test]
+fn a_correction_whose_shape_is_removed_at_once_leaves_all_labels() {
+    let shapes = family(Family::Pliers, 34, 6, &SMALL);
+    for n_steps in 0..2 {
+        let (_folder, library) = library(3, Up::Unknown);
+        stream(&library, &shapes[..4]);
+        let mut before = all_labels(&library);
+        correct(&library, &shapes[0]);
+        for _ in 0..n_steps {
+            assert!(library.relabel_next(Some(COLLECTION)).unwrap());
+        }
+        library.remove(COLLECTION, &shapes[0].name, None).unwrap();
+        carry(&library);
+        before.remove(&shapes[0].name);
+        assert_eq!(all_labels(&library), before, "after {n_steps} steps");
+        stream(&library, &shapes[4..]);
+        let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+        assert_eq!(used, (0..3).collect(), "after {n_steps} steps");
+    }
 }
 
 #[test]

@@ -4,7 +4,8 @@
 use coseg::Library;
 use coseg::labels::score::{Score, ScoredShape, score};
 use coseg::library::{
-    CollectionSpec, EventKind, LibraryError, MAX_MAPS, MAX_REPRESENTATIVES, NewShape, Outcome, Up,
+    Code, CollectionSpec, EventKind, LibraryError, MAX_MAPS, MAX_REPRESENTATIVES, NewShape,
+    Outcome, Up,
 };
 use coseg::mesh::write::off;
 use coseg::mesh::{Format, TriMesh, parse};
@@ -228,7 +229,7 @@ fn names_bytes_and_replacement_follow_the_rules() {
 
     let mut other = file(&shapes[0].name, &shapes[1].mesh);
     match library.add(COLLECTION, other.clone()) {
-        Err(LibraryError::Refused(why)) => assert_eq!(why.code, "ALREADY_EXISTS"),
+        Err(LibraryError::Refused(why)) => assert_eq!(why.code, Code::AlreadyExists),
         result => panic!("{result:?}"),
     }
     assert_eq!(all_labels(&library), before);
@@ -377,7 +378,7 @@ fn bad_meshes_are_refused_with_a_reason_and_change_nothing() {
         };
         match library.add(COLLECTION, shape) {
             Err(LibraryError::Refused(why)) => {
-                assert_eq!(why.code, "INVALID_ARGUMENT", "{name}: {why:?}");
+                assert_eq!(why.code, Code::InvalidArgument, "{name}: {why:?}");
                 assert!(!why.message.is_empty());
             }
             result => panic!("{name}: {result:?}"),

@@ -2,7 +2,6 @@
 
 use crate::daemon::answer::Answer;
 use crate::daemon::failures::panicked;
-use crate::ipc::convert;
 use crate::ipc::wire::{self, reply};
 use crate::library::{self, Failure, ItemState, LibraryError};
 use crate::store::StoreError;
@@ -51,7 +50,7 @@ pub(super) fn refusal(error: &LibraryError) -> Value {
     match error {
         LibraryError::Store(StoreError::NoSpace { path }) => json!({ "no_space": path }),
         LibraryError::Store(StoreError::ReadOnly { cause, .. }) => json!({ "read_only": cause }),
-        other => json!({ "error": convert::library_failure(other) }),
+        other => json!({ "error": Failure::from(other) }),
     }
 }
 

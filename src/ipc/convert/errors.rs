@@ -2,7 +2,7 @@
 
 use crate::ipc::frames::FrameError;
 use crate::ipc::wire::{Error, ErrorCode, ErrorReason, error::Subject};
-use crate::library::{Failure, FailureSubject, LibraryError};
+use crate::library::{Code, Failure, FailureSubject, LibraryError, Reason};
 use crate::store::StoreError;
 
 /// Maximum number of characters of an error's message.
@@ -51,74 +51,33 @@ pub fn frame_error(e: &FrameError) -> Error {
 
 /// The reason with this stable name. A reason that this version of the protocol lacks stays
 /// unspecified; the message describes it.
-fn reason(name: &str) -> ErrorReason {
-    ErrorReason::from_str_name(&format!("ERROR_REASON_{name}")).unwrap_or(ErrorReason::Unspecified)
+fn reason(reason: Reason) -> ErrorReason {
+    let name = format!("ERROR_REASON_{}", reason.name());
+    ErrorReason::from_str_name(&name).unwrap_or(ErrorReason::Unspecified)
+}
+
+fn code(code: Code) -> ErrorCode {
+    let name = format!("ERROR_CODE_{}", code.name());
+    ErrorCode::from_str_name(&name).unwrap_or(ErrorCode::Internal)
 }
 
 /// The error for a failed operation of the library.
 pub fn library_error(e: &LibraryError) -> Error {
-    let message = e.to_string();
+    let error = failure(&Failure::from(e));
     match e {
-        LibraryError::InvalidArgument { reason: name, .. } => {
-            error(ErrorCode::InvalidArgument, reason(name), message)
-        }
-        LibraryError::InvalidFace {
-            reason: name,
-            subject: place,
-            ..
-        } => with_subject(
-            error(ErrorCode::InvalidArgument, reason(name), message),
-            subject(*place),
-        ),
-        LibraryError::NotFound { what, .. } => {
-            let reason = match *what {
-                "collection" => ErrorReason::NoCollection,
-                "shape" => ErrorReason::NoShape,
-                "label" => ErrorReason::NoLabel,
-                "job" => ErrorReason::NoJob,
-                "version" => ErrorReason::NoVersion,
-                _ => ErrorReason::Unspecified,
-            };
-            error(ErrorCode::NotFound, reason, message)
-        }
-        LibraryError::AlreadyExists { reason: name, .. } => {
-            error(ErrorCode::AlreadyExists, reason(name), message)
-        }
-        LibraryError::FailedPrecondition { reason: name, .. } => {
-            error(ErrorCode::FailedPrecondition, reason(name), message)
-        }
-        LibraryError::Refused(why) => failure(why),
-        LibraryError::Store(e) => store_error(e, message),
-    }
-}
-
-fn store_error(e: &StoreError, message: String) -> Error {
-    match e {
-        StoreError::NoSpace { .. } => Error {
+        LibraryError::Store(StoreError::NoSpace { .. }) => Error {
             retry_after_ms: DISK_FULL_RETRY_MS,
-            ..error(ErrorCode::ResourceExhausted, ErrorReason::NoSpace, message)
+            ..error
         },
-        StoreError::ReadOnly { .. } => error(
-            ErrorCode::FailedPrecondition,
-            ErrorReason::ReadOnly,
-            message,
-        ),
-        e if e.is_damage() => error(ErrorCode::DataLoss, ErrorReason::Damaged, message),
-        _ => error(ErrorCode::Internal, ErrorReason::Store, message),
+        _ => error,
     }
 }
 
 /// The error for a failed shape of a job.
 pub fn failure(f: &Failure) -> Error {
-    let code = ErrorCode::from_str_name(&format!("ERROR_CODE_{}", f.code));
-    let error = error(
-        code.unwrap_or(ErrorCode::Internal),
-        reason(&f.reason),
-        f.message.clone(),
-    );
     Error {
         subject: f.subject.map(subject),
-        ..error
+        ..error(code(f.code), reason(f.reason), f.message.clone())
     }
 }
 
@@ -130,27 +89,15 @@ fn subject(place: FailureSubject) -> Subject {
     }
 }
 
-/// The failure of a shape that the library refused to place.
-pub fn library_failure(e: &LibraryError) -> Failure {
-    let wire = library_error(e);
-    let strip = |name: &'static str, prefix| name.strip_prefix(prefix).unwrap_or(name).to_owned();
-    Failure {
-        code: strip(wire.code().as_str_name(), "ERROR_CODE_"),
-        reason: strip(wire.reason().as_str_name(), "ERROR_REASON_"),
-        message: wire.message,
-        subject: None,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::{ErrorCode, ErrorReason, failure, library_error};
-    use crate::library::{Failure, LibraryError};
+    use crate::library::{Code, Failure, LibraryError, Named, Reason};
 
     #[test]
     fn library_errors_keep_code_reason_and_message() {
         let e = library_error(&LibraryError::InvalidArgument {
-            reason: "BAD_NAME",
+            reason: Reason::BadName,
             message: "the name has 300 characters, the limit is 255".to_owned(),
         });
         assert_eq!(
@@ -159,7 +106,7 @@ mod tests {
         );
         assert_eq!(e.message, "the name has 300 characters, the limit is 255");
         let e = library_error(&LibraryError::NotFound {
-            what: "shape",
+            what: Named::Shape,
             name: "x".to_owned(),
             nearest: Some("xy".to_owned()),
         });
@@ -171,10 +118,22 @@ mod tests {
     }
 
     #[test]
+    fn every_code_and_reason_is_on_the_wire() {
+        for code in Code::ALL {
+            let name = format!("ERROR_CODE_{}", code.name());
+            assert_eq!(super::code(*code).as_str_name(), name);
+        }
+        for reason in Reason::ALL {
+            let name = format!("ERROR_REASON_{}", reason.name());
+            assert_eq!(super::reason(*reason).as_str_name(), name);
+        }
+    }
+
+    #[test]
     fn failures_of_shapes_keep_their_names() {
         let e = failure(&Failure {
-            code: "INVALID_ARGUMENT".to_owned(),
-            reason: "NON_FINITE_VERTEX".to_owned(),
+            code: Code::InvalidArgument,
+            reason: Reason::NonFiniteVertex,
             message: "vertex 3 is NaN".to_owned(),
             subject: Some(crate::library::FailureSubject::Vertex(3)),
         });

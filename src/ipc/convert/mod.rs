@@ -22,9 +22,7 @@ pub use collections::{
     up_name, updated,
 };
 pub use corrections::{corrected, correction, suggested, undone};
-pub use errors::{
-    error, failure, field_error, frame_error, library_error, library_failure, with_subject,
-};
+pub use errors::{error, failure, field_error, frame_error, library_error, with_subject};
 pub use events::event;
 pub use jobs::{
     Ingest, ShapeInput, Source, add_shapes, carrying_job, format_from_wire, item, job_finished,

@@ -184,7 +184,7 @@ fn attempts_are_counted_across_restarts() {
         replace: false,
     };
     let job = library
-        .submit("c", &library.keep(vec![shape]).unwrap(), None)
+        .submit("c", &library.store_originals(vec![shape]).unwrap(), None)
         .unwrap();
     for attempt in 1..=2 {
         assert_eq!(
@@ -200,8 +200,8 @@ fn attempts_are_counted_across_restarts() {
         3
     );
     let failure = coseg::library::Failure {
-        code: "INTERNAL".into(),
-        reason: "WORKER_DIED".into(),
+        code: coseg::library::Code::Internal,
+        reason: coseg::library::Reason::WorkerDied,
         message: "it aborted".into(),
         subject: None,
     };

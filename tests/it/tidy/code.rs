@@ -32,6 +32,34 @@ const IMPURE_CRATES: [&str; 13] = [
 ];
 const PRINTS: [&str; 4] = ["eprint", "eprintln", "print", "println"];
 
+/// The one file that writes what follows from labels, and lets a collection in memory follow.
+const CHANGE_FILE: &str = "src/library/change.rs";
+/// The one file that changes a collection in memory, and the methods that may.
+const COLLECTION_FILE: &str = "src/library/collection/mod.rs";
+const COLLECTION_CHANGES: [&str; 2] = ["apply", "set_aside"];
+/// Methods of the store's transactions that write what follows from labels.
+const LABEL_WRITES: [&str; 19] = [
+    "append_event",
+    "delete_correction",
+    "delete_shape",
+    "insert_correction",
+    "insert_shape",
+    "mark_all_stale",
+    "mark_stale_before",
+    "put_label",
+    "put_labels",
+    "put_map",
+    "reserve_label",
+    "set_epoch",
+    "set_model",
+    "set_parameters",
+    "set_pins",
+    "set_stale",
+    "set_state",
+    "take_labels",
+    "take_ordinal",
+];
+
 /// The modules of a crate in the order of the data flow, as its `lib.rs` lists them.
 pub(super) struct Flow {
     /// The folder of its sources, from the root of the project.
@@ -115,6 +143,35 @@ pub(super) fn code_faults(flow: &Flow, file: &str, text: &str) -> Vec<String> {
                 faults.push(format!("{file} is pure, but names {what}"));
             }
         });
+    }
+    faults
+}
+
+/// Where a file of the library writes what follows from labels, or changes a collection in memory,
+/// though only one file does.
+pub(super) fn change_faults(file: &str, text: &str) -> Vec<String> {
+    let mut faults = Vec::new();
+    if !file.starts_with("src/library/") || file.ends_with("/tests.rs") {
+        return faults;
+    }
+    let tokens = tokens(text);
+    for called in tokens.windows(3) {
+        let [dot, name, open] = called else { continue };
+        let is_call = dot == "." && open == "(";
+        if is_call && LABEL_WRITES.contains(&name.as_str()) && file != CHANGE_FILE {
+            faults.push(format!("{file} calls {name}, but only {CHANGE_FILE} may"));
+        }
+        if is_call && name == "apply" && file != CHANGE_FILE {
+            faults.push(format!("{file} calls apply, but only {CHANGE_FILE} may"));
+        }
+    }
+    if file == COLLECTION_FILE {
+        for method in tokens.windows(6) {
+            let is_mut = method[2..] == ["(", "&", "mut", "self"];
+            if is_mut && method[0] == "fn" && !COLLECTION_CHANGES.contains(&method[1].as_str()) {
+                faults.push(format!("{file}: {} changes the collection", method[1]));
+            }
+        }
     }
     faults
 }
@@ -394,6 +451,40 @@ fn planted_faults_of_the_code_are_found() {
             faults.len() == 1 && faults[0].contains(fault),
             "{file}: {text:.80}: {faults:?}"
         );
+    }
+}
+
+#[test]
+fn changes_of_labels_elsewhere_are_found() {
+    let sets = "fn f(tx: &Tx) { tx.set_state(id, b\"\")?; }";
+    let applies = "fn f(c: &mut Collection) { c.apply(change); }";
+    let changes = "impl Collection { fn apply(&mut self) {} fn grow(&mut self) {} }";
+    for (file, text, fault) in [
+        ("src/library/merge.rs", sets, Some("calls set_state")),
+        (
+            "src/library/collection/fit.rs",
+            applies,
+            Some("calls apply"),
+        ),
+        (
+            COLLECTION_FILE,
+            changes,
+            Some("grow changes the collection"),
+        ),
+        (CHANGE_FILE, sets, None),
+        (CHANGE_FILE, applies, None),
+        ("src/store/check.rs", sets, None),
+        (
+            "src/library/merge.rs",
+            "// tx.set_state(id)\nlet set_state = 1;",
+            None,
+        ),
+    ] {
+        let faults = change_faults(file, text);
+        match fault {
+            Some(fault) => assert!(faults.len() == 1 && faults[0].contains(fault), "{faults:?}"),
+            None => assert!(faults.is_empty(), "{faults:?}"),
+        }
     }
 }
 

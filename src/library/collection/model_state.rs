@@ -1,4 +1,4 @@
-//! What a collection has learnt becomes bytes and back: one safetensors buffer, kept in the catalog.
+//! The model of a collection becomes bytes and back: one safetensors buffer in the catalog.
 
 use crate::labels::{LabelModel, Normalisation, PriorLabels, Statistics};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
@@ -6,19 +6,19 @@ use std::collections::HashMap;
 
 /// The label model as it grows, and as it was when its epoch began.
 ///
-/// New shapes are labelled by `model`; stored shapes that an accepted re-clustering made stale by `base`, so that
-/// the result does not depend on when that is done.
+/// New shapes are labelled by `model`; stored shapes that an accepted re-clustering made stale are
+/// labelled by `base`, so that the result does not depend on when that is done.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Learnt {
-    pub(super) model: LabelModel,
-    pub(super) base: Statistics,
-    /// What was discovered before a person labelled anything, if that counts.
-    pub(super) prior: Option<PriorLabels>,
+pub(in crate::library) struct ModelState {
+    pub(in crate::library) model: LabelModel,
+    pub(in crate::library) base: Statistics,
+    /// The labels that were discovered before a person labelled anything, where they are evidence.
+    pub(in crate::library) prior: Option<PriorLabels>,
 }
 
-impl Learnt {
-    /// At the beginning of an epoch.
-    pub(super) fn begin(model: LabelModel) -> Self {
+impl ModelState {
+    /// The model at the beginning of an epoch.
+    pub(in crate::library) fn begin(model: LabelModel) -> Self {
         Self {
             base: model.statistics.clone(),
             model,
@@ -27,7 +27,7 @@ impl Learnt {
     }
 
     /// The model as it was when the epoch began.
-    pub(super) fn base_model(&self) -> LabelModel {
+    pub(in crate::library) fn base_model(&self) -> LabelModel {
         LabelModel {
             statistics: self.base.clone(),
             ..self.model.clone()
@@ -35,7 +35,7 @@ impl Learnt {
     }
 
     /// The bytes.
-    pub(super) fn encode(&self) -> Vec<u8> {
+    pub(in crate::library) fn encode(&self) -> Vec<u8> {
         let m = &self.model;
         let dim = m.normalisation.mean.len();
         let k = m.labels.len();
@@ -81,8 +81,8 @@ impl Learnt {
         serialize(views, Some(epoch)).expect("invariant: names are unique and metadata is text")
     }
 
-    /// The value that [`Learnt::encode`] wrote; an error says what is wrong with the bytes.
-    pub(super) fn decode(bytes: &[u8]) -> Result<Self, String> {
+    /// The value that [`ModelState::encode`] wrote; an error says what is wrong with the bytes.
+    pub(in crate::library) fn decode(bytes: &[u8]) -> Result<Self, String> {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| e.to_string())?;
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
         let epoch = header
@@ -184,7 +184,7 @@ fn square(triangle: &[f64], dim: usize) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    fn sample() -> Learnt {
+    fn sample() -> ModelState {
         let dim = 4;
         let prior = PriorLabels {
             statistics: Statistics::empty(3, dim),
@@ -209,18 +209,18 @@ mod tests {
             statistics,
             up,
         };
-        Learnt {
+        ModelState {
             prior: Some(prior),
-            ..Learnt::begin(model)
+            ..ModelState::begin(model)
         }
     }
 
     #[test]
     fn reads_back_what_was_written() {
-        let learnt = sample();
-        let discovered = Learnt::begin(learnt.model.clone());
-        for learnt in [learnt, discovered] {
-            assert_eq!(Learnt::decode(&learnt.encode()), Ok(learnt));
+        let state = sample();
+        let discovered = ModelState::begin(state.model.clone());
+        for state in [state, discovered] {
+            assert_eq!(ModelState::decode(&state.encode()), Ok(state));
         }
     }
 
@@ -228,7 +228,7 @@ mod tests {
     fn damage_is_an_error() {
         let bytes = sample().encode();
         for n in 0..bytes.len() {
-            assert!(Learnt::decode(&bytes[..n]).is_err(), "cut to {n} bytes");
+            assert!(ModelState::decode(&bytes[..n]).is_err(), "cut to {n} bytes");
         }
     }
 }

@@ -1,0 +1,186 @@
+//! A collection before a change by a person: what undoing the change needs, as the catalog stores
+//! it.
+
+use super::collection::{Collection, ModelState, State, StoredState};
+use super::error::Result;
+use super::rows::{damaged, from_json, to_json};
+use super::types::LabelId;
+use crate::store::{CorrectionRow, LabelRow, Reader, ShapeId};
+use serde::{Deserialize, Serialize};
+
+/// A collection as it was before a change by a person.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Before {
+    labels: Vec<StoredLabel>,
+    /// `None`: the change concerns names only.
+    pub(super) rest: Option<Rest>,
+    /// Which way was up, if the change concerns that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) up: Option<String>,
+    /// The bytes of the model; none if there was no model.
+    #[serde(skip)]
+    model: Vec<u8>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct StoredLabel {
+    id: u32,
+    name: Option<String>,
+    colour: [u8; 3],
+    merged_into: Option<u32>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Rest {
+    state: StoredState,
+    epoch: u64,
+    /// Shapes of this ordinal and above came later.
+    pub(super) next_ordinal: u64,
+    /// Shapes whose labels waited to be recomputed.
+    pub(super) stale: Vec<i64>,
+    /// Pinned faces of the shapes that the change touches.
+    pub(super) pins: Vec<(i64, Option<Vec<i32>>)>,
+}
+
+impl Before {
+    /// The labels before one gets a name.
+    pub(super) fn names(labels: Vec<LabelRow>) -> Self {
+        Self {
+            labels: labels.into_iter().map(StoredLabel::from).collect(),
+            rest: None,
+            up: None,
+            model: Vec::new(),
+        }
+    }
+
+    /// A collection before another way is up.
+    pub(super) fn up(reader: &Reader<'_>, collection: &Collection) -> Result<Self> {
+        Ok(Self {
+            up: Some(collection.row().up.clone()),
+            ..Self::labels(reader, collection, &[])?
+        })
+    }
+
+    /// A collection before a change that touches the pinned faces of `shapes`.
+    pub(super) fn labels(
+        reader: &Reader<'_>,
+        collection: &Collection,
+        shapes: &[ShapeId],
+    ) -> Result<Self> {
+        let stale = reader.stale_shapes(collection.id())?;
+        let pins = shapes.iter().map(|s| Ok((s.0, reader.pins(*s)?)));
+        let rest = Rest {
+            state: collection.state().clone().into(),
+            epoch: collection.row().epoch,
+            next_ordinal: collection.row().next_ordinal,
+            stale: stale.into_iter().map(|s| s.0).collect(),
+            pins: pins.collect::<Result<_>>()?,
+        };
+        Ok(Self {
+            rest: Some(rest),
+            model: reader.model(collection.id())?.unwrap_or_default(),
+            ..Self::names(reader.labels(collection.id())?)
+        })
+    }
+
+    /// The bytes: length of the text (u32), the text, the model.
+    pub(super) fn encode(&self) -> Vec<u8> {
+        let text = to_json(self);
+        let n = u32::try_from(text.len()).expect("invariant: the state is less than 4 GiB");
+        [&n.to_le_bytes(), text.as_bytes(), &self.model].concat()
+    }
+
+    pub(super) fn decode(row: &CorrectionRow) -> Result<Self> {
+        let location = format!("corrections {}", row.id);
+        let bad = || damaged(&location, "before is cut");
+        let (n, bytes) = row.before.split_first_chunk::<4>().ok_or_else(bad)?;
+        let n = u32::from_le_bytes(*n) as usize;
+        let (text, model) = bytes.split_at_checked(n).ok_or_else(bad)?;
+        let text = std::str::from_utf8(text).map_err(|e| damaged(&location, &e.to_string()))?;
+        let before: Self = from_json(text, &location)?;
+        Ok(Self {
+            model: model.to_vec(),
+            ..before
+        })
+    }
+
+    /// The row of a label as it was; `None`: it did not exist.
+    pub(super) fn label(&self, id: LabelId) -> Option<LabelRow> {
+        let found = self.labels.iter().find(|l| l.id == id);
+        found.cloned().map(LabelRow::from)
+    }
+
+    /// The model as it was; `None`: there was none.
+    pub(super) fn model(&self) -> Result<Option<ModelState>> {
+        if self.model.is_empty() {
+            return Ok(None);
+        }
+        let model = ModelState::decode(&self.model);
+        model.map(Some).map_err(|e| damaged("corrections", &e))
+    }
+}
+
+impl Rest {
+    /// The state as it was.
+    pub(super) fn state(&self) -> State {
+        self.state.clone().into()
+    }
+}
+
+impl From<LabelRow> for StoredLabel {
+    fn from(row: LabelRow) -> Self {
+        Self {
+            id: row.id,
+            name: row.name,
+            colour: row.colour,
+            merged_into: row.merged_into,
+        }
+    }
+}
+
+impl From<StoredLabel> for LabelRow {
+    fn from(label: StoredLabel) -> Self {
+        Self {
+            id: label.id,
+            name: label.name,
+            colour: label.colour,
+            merged_into: label.merged_into,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_state_before_a_change_reads_back() {
+        let label = LabelRow {
+            id: 3,
+            name: Some("leg".into()),
+            colour: [1, 2, 3],
+            merged_into: None,
+        };
+        let rest = Rest {
+            state: StoredState::default(),
+            epoch: 4,
+            next_ordinal: 9,
+            stale: vec![7],
+            pins: vec![(5, Some(vec![-1, 3])), (6, None)],
+        };
+        let before = Before {
+            rest: Some(rest),
+            model: vec![1, 2, 3],
+            ..Before::names(vec![label])
+        };
+        let mut row = CorrectionRow {
+            id: 1,
+            kind: "correct".into(),
+            detail_json: "{}".into(),
+            before: before.encode(),
+        };
+        assert_eq!(Before::decode(&row).expect("decodes"), before);
+        row.before.truncate(20);
+        assert!(Before::decode(&row).is_err());
+    }
+}

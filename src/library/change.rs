@@ -1,0 +1,514 @@
+//! The one way in which a collection changes: everything that becomes true together is a
+//! [`Change`], and [`commit`] writes it in one transaction, with what undoing it needs, and then
+//! brings the collection in memory up to it.
+
+use super::before::Before;
+use super::collection::{
+    Applied, Collection, KnownShape, ModelState, Propagation, Staleness, State,
+};
+use super::error::{LibraryError, Result};
+use super::labelling::{NewLabels, Relabelled, cause};
+use super::once::{Request, once, unix_secs};
+use super::reason::Reason;
+use super::rows::{damaged, label_colour, quality_to_json, to_json};
+use super::types::{EventKind, LabelId};
+use crate::fmap::FunctionalMap;
+use crate::pipeline::LabelChange;
+use crate::store::catalog::KIND_NAME;
+use crate::store::{
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, MapRow, NewShapeRow, ObjectRow,
+    ShapeId, Store, Tx,
+};
+
+/// What becomes true together. Fields are written, and their events logged, in this order.
+#[derive(Debug, Default)]
+pub(super) struct Change {
+    /// The queued item that the change settles; if it is over by now, nothing changes.
+    pub(super) accepted: Option<JobItemRow>,
+    /// The change is one by a person, which can be undone.
+    pub(super) undoable: Option<Undoable>,
+    /// A shape that goes, and its name.
+    pub(super) removed: Option<(ShapeId, String)>,
+    /// Which way is up from now on.
+    pub(super) up: Option<String>,
+    /// The event that comes before those of labels.
+    pub(super) opening: Option<EventKind>,
+    /// What happens to labels of the collection.
+    pub(super) labels: Vec<LabelEdit>,
+    /// New pins of shapes; `None`: no face is pinned.
+    pub(super) pins: Vec<(ShapeId, Option<Vec<i32>>)>,
+    /// A shape that comes.
+    pub(super) added: Option<Box<Addition>>,
+    /// Maps between stored shapes.
+    pub(super) maps: Vec<MapRow>,
+    /// The event that comes between those of labels and those of stored shapes.
+    pub(super) closing: Option<EventKind>,
+    /// Stored shapes with new labels.
+    pub(super) relabelled: Vec<Relabelled>,
+    /// Which shapes are stale then.
+    pub(super) staleness: Staleness,
+    /// Shapes that are stale or not in spite of `staleness`.
+    pub(super) stale: Vec<(ShapeId, bool)>,
+    /// Another model.
+    pub(super) model: Option<ModelState>,
+    /// Another state.
+    pub(super) state: Option<State>,
+    /// Whether a job propagates the change to the stale shapes.
+    pub(super) propagates: bool,
+    /// The change by a person that this one undoes.
+    pub(super) undone: Option<i64>,
+}
+
+/// A change by a person.
+#[derive(Debug)]
+pub(super) enum Undoable {
+    Correct { shape: String },
+    Name,
+    Merge { label: LabelId, into: LabelId },
+    Split { label: LabelId, new: LabelId },
+    Up { from: String, to: String },
+}
+
+/// Something that happens to a label of the collection.
+#[derive(Debug)]
+pub(super) enum LabelEdit {
+    /// A label is created, merged or split.
+    Changed(LabelChange),
+    /// A person uses the label; it is created if it is not there.
+    Used(LabelId),
+    /// The label is used no more.
+    Retired(LabelId),
+    /// The label gets a name.
+    Named(LabelRow, String),
+    /// The label is as it was before.
+    Restored(LabelRow),
+}
+
+/// A new shape with everything that is stored of it.
+#[derive(Debug)]
+pub(super) struct Addition {
+    object: ObjectRow,
+    shape: NewShapeRow,
+    /// Its labels, in their version.
+    labels: NewLabels,
+    /// Maps from stored shapes to it.
+    maps: Vec<(ShapeId, FunctionalMap)>,
+}
+
+/// A change that is written but not committed yet.
+#[derive(Debug)]
+pub(super) struct Written {
+    /// The collection's row after it.
+    pub(super) row: CollectionRow,
+    /// The job that propagates it; 0: none does.
+    pub(super) job: u64,
+    /// The new shape.
+    added: Option<ShapeId>,
+    /// The state in `row`, if it is another one than before.
+    state: Option<State>,
+}
+
+impl From<LabelChange> for LabelEdit {
+    fn from(change: LabelChange) -> Self {
+        Self::Changed(change)
+    }
+}
+
+impl Undoable {
+    pub(super) fn kind(&self) -> &'static str {
+        match self {
+            Self::Correct { .. } => "correct",
+            Self::Name => KIND_NAME,
+            Self::Merge { .. } => "merge",
+            Self::Split { .. } => "split",
+            Self::Up { .. } => "up",
+        }
+    }
+
+    fn detail(&self) -> String {
+        let detail = match self {
+            Self::Correct { shape } => serde_json::json!({ "shape": shape }),
+            Self::Name => serde_json::json!({}),
+            Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
+            Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
+            Self::Up { from, to } => serde_json::json!({ "from": from, "to": to }),
+        };
+        to_json(&detail)
+    }
+}
+
+/// Writes a change in one transaction together with what `finish` writes, and brings the collection
+/// up to it.
+///
+/// # Errors
+/// The store fails, or the collection was deleted meanwhile; then nothing is written.
+pub(super) fn commit<T>(
+    store: &Store,
+    collection: &mut Collection,
+    mut change: Change,
+    finish: impl FnOnce(&Tx<'_>, &Written) -> Result<T>,
+) -> Result<T> {
+    let (written, value) = store.catalog().write(|tx| -> Result<_> {
+        let written = change.write(tx, collection)?;
+        let value = finish(tx, &written)?;
+        Ok((written, value))
+    })?;
+    collection.apply(change.applied(written));
+    Ok(value)
+}
+
+/// [`commit`] of a request that takes effect once: `finish` makes its reply, which is returned, or
+/// the reply that was given before.
+pub(super) fn commit_once(
+    store: &Store,
+    collection: &mut Collection,
+    mut change: Change,
+    request: &Request<'_>,
+    finish: impl FnOnce(&Tx<'_>, &Written) -> Result<Vec<u8>>,
+) -> Result<Vec<u8>> {
+    let mut written = None;
+    let reply = store.catalog().write(|tx| {
+        once(tx, request, |tx| {
+            let now = change.write(tx, collection)?;
+            let reply = finish(tx, &now)?;
+            written = Some(now);
+            Ok(reply)
+        })
+    })?;
+    if let Some(written) = written {
+        collection.apply(change.applied(written));
+    }
+    Ok(reply)
+}
+
+impl Change {
+    fn write(&mut self, tx: &Tx<'_>, collection: &Collection) -> Result<Written> {
+        let id = collection.id();
+        if tx.collection_by_id(id)?.is_none() {
+            return Err(LibraryError::deleted(&collection.row().name));
+        }
+        if let Some(accepted) = &self.accepted {
+            still_queued(tx, accepted)?;
+        }
+        if let Some(undoable) = &self.undoable {
+            let pins: Vec<ShapeId> = self.pins.iter().map(|p| p.0).collect();
+            let before = match undoable {
+                Undoable::Name => Before::names(tx.labels(id)?),
+                Undoable::Up { .. } => Before::up(tx, collection)?,
+                _ => Before::labels(tx, collection, &pins)?,
+            };
+            tx.insert_correction(id, undoable.kind(), &undoable.detail(), &before.encode())?;
+        }
+        if let Some((shape, name)) = &self.removed {
+            tx.delete_shape(*shape)?;
+            event(
+                tx,
+                id,
+                &EventKind::ShapeRemoved {
+                    shape: name.clone(),
+                },
+            )?;
+        }
+        if let Some(up) = &self.up {
+            tx.set_parameters(id, collection.row().n_parts, up)?;
+        }
+        if let Some(opening) = &self.opening {
+            event(tx, id, opening)?;
+        }
+        for edit in &self.labels {
+            edit.write(tx, id)?;
+        }
+        for (shape, pins) in &self.pins {
+            tx.set_pins(*shape, pins.as_deref())?;
+        }
+        let added = self.added.as_mut().map(|a| a.write(tx, id)).transpose()?;
+        for map in &self.maps {
+            tx.put_map(map)?;
+        }
+        if let Some(closing) = &self.closing {
+            event(tx, id, closing)?;
+        }
+        for shape in &mut self.relabelled {
+            put_relabelled(tx, id, shape)?;
+        }
+        self.write_staleness(tx, collection)?;
+        self.write_model(tx, collection)?;
+        let job = self.write_state(tx, collection)?;
+        if let Some(undone) = self.undone {
+            // Only now: the labels above must not be noted with an older change.
+            tx.delete_correction(undone)?;
+        }
+        let row = tx.collection_by_id(id)?;
+        let row = row.ok_or_else(|| LibraryError::deleted(&collection.row().name))?;
+        let state = match row.state == collection.row().state {
+            true => None,
+            // As it would be read: numbers may lose their last bit on the way through text.
+            false => Some(State::of(&row)?),
+        };
+        Ok(Written {
+            row,
+            job,
+            added,
+            state,
+        })
+    }
+
+    fn write_staleness(&self, tx: &Tx<'_>, collection: &Collection) -> Result<()> {
+        let id = collection.id();
+        match self.staleness {
+            Staleness::AsLabelled => {}
+            Staleness::AllOthers => {
+                let model = self.model.as_ref().or(collection.model());
+                let epoch = model.map_or(0, |m| m.model.epoch);
+                tx.mark_stale_before(id, epoch)?;
+            }
+            Staleness::Unchanged => {
+                for shape in &self.relabelled {
+                    let at = collection.position(shape.shape);
+                    let stale = at.is_some_and(|at| collection.shapes()[at].stale);
+                    tx.set_stale(shape.shape, stale)?;
+                }
+            }
+            Staleness::All => {
+                tx.mark_all_stale(id)?;
+            }
+        }
+        for (shape, stale) in &self.stale {
+            tx.set_stale(*shape, *stale)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the model, which from then on is what would be read: half of each symmetric matrix is
+    /// stored, and the other half may differ from it in its last bits.
+    fn write_model(&mut self, tx: &Tx<'_>, collection: &Collection) -> Result<()> {
+        let Some(model) = &self.model else {
+            return Ok(());
+        };
+        let bytes = model.encode();
+        tx.set_model(collection.id(), &bytes)?;
+        tx.set_epoch(collection.id(), model.model.epoch)?;
+        let location = format!("collections {}", collection.row().name);
+        self.model = Some(ModelState::decode(&bytes).map_err(|e| damaged(&location, &e))?);
+        Ok(())
+    }
+
+    /// Writes the state, and the job that propagates the change; 0: none does.
+    fn write_state(&mut self, tx: &Tx<'_>, collection: &Collection) -> Result<u64> {
+        let id = collection.id();
+        let mut job = 0;
+        if self.propagates {
+            let n_shapes = tx.n_stale(id)?;
+            job = tx.insert_job(&collection.row().name, unix_secs(), &[])?;
+            let state = self.state.get_or_insert_with(|| collection.state().clone());
+            state.propagation = Some(Propagation { job, n_shapes });
+        }
+        if let Some(state) = &self.state {
+            tx.set_state(id, &state.encode())?;
+        }
+        Ok(job)
+    }
+
+    /// The change as the collection in memory shows it.
+    fn applied(self, written: Written) -> Applied {
+        let added = self
+            .added
+            .zip(written.added)
+            .map(|(addition, id)| KnownShape {
+                id,
+                ordinal: addition.shape.ordinal,
+                digest: addition.shape.content_digest,
+                stale: false,
+                pinned: false,
+                signature: addition.shape.signature,
+            });
+        Applied {
+            row: written.row,
+            state: written.state,
+            model: self.model,
+            removed: self.removed.map(|r| r.0),
+            added,
+            pinned: self.pins.iter().map(|p| (p.0, p.1.is_some())).collect(),
+            labelled: self.relabelled.iter().map(|r| r.shape).collect(),
+            staleness: self.staleness,
+            stale: self.stale,
+        }
+    }
+}
+
+impl Addition {
+    pub(super) fn new(
+        object: ObjectRow,
+        shape: NewShapeRow,
+        labels: NewLabels,
+        maps: Vec<(ShapeId, FunctionalMap)>,
+    ) -> Box<Self> {
+        Box::new(Self {
+            object,
+            shape,
+            labels,
+            maps,
+        })
+    }
+
+    fn write(&mut self, tx: &Tx<'_>, collection: CollectionId) -> Result<ShapeId> {
+        tx.insert_object(&self.object)?;
+        self.shape.ordinal = tx.take_ordinal(collection)?;
+        let id = tx.insert_shape(&self.shape)?;
+        let labels = &mut self.labels;
+        let added = EventKind::ShapeAdded {
+            shape: self.shape.name.clone(),
+            version: labels.row.version,
+            area_shares: labels.summary.area_shares.clone(),
+        };
+        labels.row.sequence = event(tx, collection, &added)?;
+        labels.row.cause = cause::ADDED.into();
+        tx.put_labels(id, &labels.row, &labels.summary)?;
+        for (from, map) in &self.maps {
+            tx.put_map(&map_row(*from, id, map))?;
+        }
+        Ok(id)
+    }
+}
+
+impl LabelEdit {
+    fn write(&self, tx: &Tx<'_>, collection: CollectionId) -> Result<()> {
+        match self {
+            Self::Changed(change) => label_change(tx, collection, change),
+            Self::Used(id) => use_label(tx, collection, *id),
+            Self::Retired(label) => {
+                event(tx, collection, &EventKind::LabelRetired { label: *label })?;
+                Ok(())
+            }
+            Self::Named(row, name) => {
+                let named = LabelRow {
+                    name: Some(name.clone()),
+                    ..row.clone()
+                };
+                tx.put_label(collection, &named)?;
+                let named = EventKind::LabelNamed {
+                    label: row.id,
+                    name: name.clone(),
+                };
+                event(tx, collection, &named)?;
+                Ok(())
+            }
+            Self::Restored(row) => Ok(tx.put_label(collection, row)?),
+        }
+    }
+}
+
+/// Refuses an item that was cancelled while it was placed, so that it is either cancelled or
+/// placed.
+fn still_queued(tx: &Tx<'_>, accepted: &JobItemRow) -> Result<()> {
+    let item = tx.job_item(accepted.job, accepted.index)?;
+    if item.is_some_and(|i| i.status == ItemStatus::Queued) {
+        return Ok(());
+    }
+    let message = format!("item {} of job {} is over", accepted.index, accepted.job);
+    let reason = Reason::Cancelled;
+    Err(LibraryError::FailedPrecondition { reason, message })
+}
+
+/// Appends an event to a collection's log and returns its sequence number.
+pub(super) fn event(tx: &Tx<'_>, collection: CollectionId, kind: &EventKind) -> Result<u64> {
+    let name = match kind {
+        EventKind::CollectionCreated => "collection_created",
+        EventKind::CollectionDeleted => "collection_deleted",
+        EventKind::ShapeAdded { .. } => "shape_added",
+        EventKind::ShapeRemoved { .. } => "shape_removed",
+        EventKind::LabelsChanged { .. } => "labels_changed",
+        EventKind::LabelCreated { .. } => "label_created",
+        EventKind::LabelMerged { .. } => "label_merged",
+        EventKind::LabelSplit { .. } => "label_split",
+        EventKind::LabelNamed { .. } => "label_named",
+        EventKind::LabelRetired { .. } => "label_retired",
+        EventKind::Corrected { .. } => "corrected",
+        EventKind::Undone { .. } => "undone",
+        EventKind::UpChanged { .. } => "up_changed",
+        EventKind::Reclustered { .. } => "reclustered",
+    };
+    Ok(tx.append_event(collection, name, &to_json(kind))?)
+}
+
+/// Writes new labels of a stored shape and the event that tells which faces changed.
+fn put_relabelled(tx: &Tx<'_>, collection: CollectionId, shape: &mut Relabelled) -> Result<()> {
+    let labels = &mut shape.labels;
+    let changed = EventKind::LabelsChanged {
+        shape: shape.name.clone(),
+        version: labels.row.version,
+        cause: labels.row.cause.clone(),
+        moves: shape.moves.clone(),
+    };
+    labels.row.sequence = event(tx, collection, &changed)?;
+    Ok(tx.put_labels(shape.shape, &labels.row, &labels.summary)?)
+}
+
+fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> Result<()> {
+    match *change {
+        LabelChange::Created(id) => {
+            let taken = tx.take_labels(collection, 1)?;
+            assert_eq!(
+                taken, id,
+                "invariant: new labels are numbered as they are created"
+            );
+            tx.put_label(collection, &new_label(id))?;
+            event(tx, collection, &EventKind::LabelCreated { label: id })?;
+        }
+        LabelChange::Merged { from, into } => {
+            if let Some(row) = tx.labels(collection)?.into_iter().find(|l| l.id == from) {
+                let merged = LabelRow {
+                    merged_into: Some(into),
+                    ..row
+                };
+                tx.put_label(collection, &merged)?;
+            }
+            event(tx, collection, &EventKind::LabelMerged { from, into })?;
+        }
+        LabelChange::Split { from, into } => {
+            let into = vec![into];
+            event(tx, collection, &EventKind::LabelSplit { from, into })?;
+        }
+    }
+    Ok(())
+}
+
+/// Brings a label into use that a person named by its id.
+fn use_label(tx: &Tx<'_>, collection: CollectionId, id: LabelId) -> Result<()> {
+    let there = tx.labels(collection)?.into_iter().find(|l| l.id == id);
+    let row = match there {
+        // In use again: what it was merged into keeps what it has.
+        Some(row) => LabelRow {
+            merged_into: None,
+            ..row
+        },
+        None => new_label(id),
+    };
+    tx.reserve_label(collection, id)?;
+    tx.put_label(collection, &row)?;
+    event(tx, collection, &EventKind::LabelCreated { label: id })?;
+    Ok(())
+}
+
+fn new_label(id: LabelId) -> LabelRow {
+    LabelRow {
+        id,
+        name: None,
+        colour: label_colour(id),
+        merged_into: None,
+    }
+}
+
+/// The row of a map.
+pub(super) fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow {
+    MapRow {
+        from,
+        to,
+        k1: map.k1 as u32,
+        k2: map.k2 as u32,
+        c_12: map.c_12.clone(),
+        p2p_21: map.p2p_21.clone(),
+        confidence: map.confidence.of_vertex.clone(),
+        quality_json: quality_to_json(&map.quality),
+    }
+}

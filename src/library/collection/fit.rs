@@ -1,0 +1,459 @@
+//! The label model is fitted to the training shapes: a few representatives are labelled together.
+//!
+//! Every step is a change of its own, so that none takes long and a crash loses little: descriptors
+//! are standardised, missing maps between the representatives are computed one shape at a time,
+//! then the model is fitted to all of them at once.
+
+use super::discovered::{MAX_MAPS, MAX_REPRESENTATIVES};
+use super::state::{Phase, Supervision};
+use super::supervised::{propagated, with};
+use super::up::UpFound;
+use super::{Collection, ModelState};
+use crate::fmap::FunctionalMap;
+use crate::labels::{Features, LabelModel, Normalisation, Statistics};
+use crate::library::change::{Change, map_row};
+use crate::library::error::Result;
+use crate::library::labelling::{Relabelled, cause};
+use crate::library::pins::{pinned_faces, pins_of, used_labels};
+use crate::library::rows::damaged;
+use crate::library::sources::{Known, Sources};
+use crate::library::types::LabelId;
+use crate::library::voting::{IncomingMap, PreparedShape, new_map};
+use crate::pipeline::{DescriptionView, Given, Lesson, LessonMap, Prepared, TeachOptions, teach};
+use crate::segmentation::Surface;
+use crate::store::LabelRow;
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+
+/// Most training shapes among the representatives that the model is fitted to.
+const MAX_FITTED_TRAINING: usize = MAX_REPRESENTATIVES / 2;
+
+/// A representative that the model is fitted to.
+struct Member {
+    at: usize,
+    known: Known,
+    /// Label of each polygon that a person gave, -1 where none; empty if nothing is pinned.
+    pins: Vec<i32>,
+    pinned_classes: Vec<Option<u32>>,
+    discovered: Vec<u8>,
+}
+
+/// The collection while a model is fitted to some of its shapes.
+struct Fit<'a> {
+    collection: &'a Collection,
+    sources: &'a dyn Sources,
+    supervision: &'a Supervision,
+    model: &'a LabelModel,
+    /// Indices of the representatives.
+    chosen: Vec<usize>,
+}
+
+/// The next step of fitting the model; `None`: it is fitted, or there is none to begin with.
+pub(in crate::library) fn step(
+    collection: &Collection,
+    sources: &dyn Sources,
+) -> Result<Option<Change>> {
+    let supervision = collection.state().regime.supervision();
+    let (Some(supervision), Some(model)) = (supervision, collection.label_model()) else {
+        return Ok(None);
+    };
+    let fit = Fit {
+        collection,
+        sources,
+        supervision,
+        model,
+        chosen: members(collection),
+    };
+    if supervision.phase() != Phase::Fitted && fit.labels()?.is_empty() {
+        return fit.unfounded().map(Some);
+    }
+    match supervision.phase() {
+        Phase::Fitted => Ok(None),
+        Phase::Outdated => fit.standardised().map(Some),
+        Phase::Standardised => {
+            let known = fit.known()?;
+            match fit.missing_maps(&known)? {
+                Some(maps) => Ok(Some(maps)),
+                None => fit.fitted(known).map(Some),
+            }
+        }
+    }
+}
+
+/// The shapes that the model is fitted to: training shapes and others, of each those of the least
+/// digests, by these.
+pub(in crate::library) fn members(collection: &Collection) -> Vec<usize> {
+    let shapes = collection.shapes();
+    let by_digest = collection.representatives(shapes.len());
+    let of = |pinned: bool, limit: usize| {
+        let all = by_digest.iter().copied();
+        let all = all.filter(|at| shapes[*at].pinned == pinned);
+        all.take(limit).collect::<Vec<usize>>()
+    };
+    let mut chosen = of(true, MAX_FITTED_TRAINING);
+    chosen.extend(of(false, MAX_REPRESENTATIVES - chosen.len()));
+    chosen
+}
+
+impl Fit<'_> {
+    fn known(&self) -> Result<Vec<Known>> {
+        let shapes = self.collection.shapes();
+        let known = self
+            .chosen
+            .iter()
+            .map(|at| self.sources.known(shapes[*at].id));
+        known.collect()
+    }
+
+    /// Ends a fit for which nobody's labels are left, because the training shapes were removed
+    /// before it: all shapes keep the labels they have, and the model stays or, if its descriptors
+    /// are standardised already, follows from these labels.
+    fn unfounded(&self) -> Result<Change> {
+        let shapes = self.collection.shapes();
+        let mut model = self.model.clone();
+        if self.supervision.phase() == Phase::Standardised {
+            for known in self.known()? {
+                let prepared = Prepared::new(&known.view(), &model);
+                let class = |f: usize| {
+                    let label = i64::from(known.labels.proxy_labels[f]);
+                    let found = model.labels.iter().position(|l| i64::from(*l) == label);
+                    found.map(|c| c as u32)
+                };
+                let (features, area) = (&prepared.features, &prepared.surface.area);
+                let k = model.labels.len();
+                let of_shape = Statistics::of_shape(features, area, class, k);
+                model.statistics.accumulate(&of_shape, 1.0);
+            }
+        }
+        let trained = self.chosen.iter().map(|at| shapes[*at].ordinal).collect();
+        let supervision = self.supervision.clone().fitted(trained);
+        Ok(Change {
+            stale: shapes.iter().map(|s| (s.id, false)).collect(),
+            model: Some(ModelState::begin(model)),
+            state: Some(with(self.collection, supervision)),
+            ..Change::default()
+        })
+    }
+
+    /// Standardises descriptors over the representatives.
+    fn standardised(&self) -> Result<Change> {
+        let known = self.known()?;
+        let views: Vec<DescriptionView<'_>> = known.iter().map(Known::view).collect();
+        let found = UpFound::of(self.collection.up(), &views.iter().collect::<Vec<_>>());
+        let up = found.axis;
+        let parts: Vec<(Features, Surface)> = views
+            .par_iter()
+            .map(|v| (Features::raw(v, up), Surface::new(&v.mesh())))
+            .collect();
+        let weighted = parts.iter().map(|(f, s)| (f, s.area.as_slice()));
+        let normalisation = Normalisation::fit(weighted, up.is_some());
+        let (k, dim) = (self.model.labels.len(), normalisation.mean.len());
+        let model = LabelModel {
+            epoch: self.model.epoch + 1,
+            labels: self.model.labels.clone(),
+            normalisation,
+            statistics: Statistics::empty(k, dim),
+            up,
+        };
+        let supervision = self.supervision.clone().standardised();
+        Ok(Change {
+            model: Some(ModelState::begin(model)),
+            state: Some(with(self.collection, supervision).with_up(&found)),
+            ..Change::default()
+        })
+    }
+
+    /// The members that vote for member `to`: the nearest training shapes, and the nearest others.
+    fn voters_of(&self, known: &[Known], to: usize) -> Vec<usize> {
+        let shapes = self.collection.shapes();
+        let view = known[to].view();
+        let nearest = |pinned: bool| {
+            let others = self.chosen.iter().copied();
+            let among: Vec<usize> = others
+                .filter(|at| shapes[*at].pinned == pinned && *at != self.chosen[to])
+                .collect();
+            let (signature, n) = (view.signature, view.n_descriptors);
+            self.collection
+                .nearest_among(&among, signature, n, MAX_MAPS)
+        };
+        let position = |(at, _): (usize, f64)| self.chosen.iter().position(|c| *c == at);
+        let training = nearest(true).into_iter();
+        training
+            .chain(nearest(false))
+            .filter_map(position)
+            .collect()
+    }
+
+    /// Computes the maps that are missing to the first member that lacks some; `None`: none does.
+    fn missing_maps(&self, known: &[Known]) -> Result<Option<Change>> {
+        for to in 0..known.len() {
+            let mut missing = Vec::new();
+            for from in self.voters_of(known, to) {
+                let stored = self.sources.map(known[from].row.id, known[to].row.id)?;
+                if stored.is_none() {
+                    missing.push(&known[from]);
+                }
+            }
+            if missing.is_empty() {
+                continue;
+            }
+            let shape = PreparedShape::new(known[to].view(), self.model);
+            let maps: Vec<FunctionalMap> = missing
+                .par_iter()
+                .map(|from| new_map(from, &shape, self.model))
+                .collect();
+            let rows = missing.iter().zip(&maps);
+            let rows = rows.map(|(from, map)| map_row(from.row.id, known[to].row.id, map));
+            return Ok(Some(Change {
+                maps: rows.collect(),
+                ..Change::default()
+            }));
+        }
+        Ok(None)
+    }
+
+    /// Labels the representatives together and fits the model to them.
+    fn fitted(&self, known: Vec<Known>) -> Result<Change> {
+        let mut model = LabelModel {
+            labels: self.labels()?,
+            ..self.model.clone()
+        };
+        let k = model.labels.len();
+        let maps = self.incoming_maps(&known)?;
+        let members = self.members(known, &model.labels)?;
+        let views: Vec<DescriptionView<'_>> = members.iter().map(|m| m.known.view()).collect();
+        let prepared: Vec<Prepared> = views.par_iter().map(|v| Prepared::new(v, &model)).collect();
+        let lessons: Vec<Lesson<'_>> = members
+            .iter()
+            .zip(&views)
+            .zip(&prepared)
+            .map(|((m, shape), prepared)| Lesson {
+                shape: *shape,
+                prepared,
+                pinned: &m.pinned_classes,
+                discovered: &m.discovered,
+            })
+            .collect();
+        let maps: Vec<LessonMap<'_>> = maps
+            .iter()
+            .map(|(from, to, m)| LessonMap {
+                from: *from,
+                to: *to,
+                p2p: m.p2p_21(),
+                confidence: m.confidence(),
+            })
+            .collect();
+        let statistics = self.evidence_elsewhere(&model)?;
+        let discovered = self.discovered_statistics(&model)?;
+        let given = Given {
+            statistics: &statistics,
+            n_exemplars: self.collection.shapes().iter().filter(|s| s.pinned).count(),
+            discovered: discovered.as_ref(),
+        };
+        let fitted = teach(&lessons, &maps, &given, k, &TeachOptions::default());
+        model.statistics = fitted.statistics;
+        let model = ModelState {
+            prior: fitted.prior,
+            ..ModelState::begin(model)
+        };
+        let changed: Vec<Result<Relabelled>> = members
+            .par_iter()
+            .zip(&fitted.labellings)
+            .filter(|(m, _)| m.pins.is_empty() || m.pins.iter().any(|l| *l < 0))
+            .map(|(m, labelling)| {
+                let labels = propagated(self.sources, &m.known, labelling, &model.model, &m.pins)?;
+                Ok(Relabelled::new(&m.known, labels, cause::PROPAGATION))
+            })
+            .collect();
+        let shapes = self.collection.shapes();
+        let trained = members.iter().map(|m| shapes[m.at].ordinal).collect();
+        let supervision = self.supervision.clone().fitted(trained);
+        Ok(Change {
+            relabelled: changed.into_iter().collect::<Result<_>>()?,
+            stale: members.iter().map(|m| (m.known.row.id, false)).collect(),
+            model: Some(model),
+            state: Some(with(self.collection, supervision)),
+            ..Change::default()
+        })
+    }
+
+    /// The labels of the new model's classes.
+    fn labels(&self) -> Result<Vec<LabelId>> {
+        let used = used_labels(self.collection, self.sources, None)?;
+        let mut labels: BTreeSet<LabelId> = used.labels;
+        if !self.supervision.is_closed() {
+            labels.extend(self.resolved_discovered()?);
+        }
+        Ok(labels.into_iter().collect())
+    }
+
+    /// The stored maps between the members.
+    fn incoming_maps(&self, known: &[Known]) -> Result<Vec<(usize, usize, IncomingMap)>> {
+        let mut maps = Vec::new();
+        for to in 0..known.len() {
+            for from in self.voters_of(known, to) {
+                let (a, b) = (known[from].row.id, known[to].row.id);
+                let row = self.sources.map(a, b)?;
+                let row = row.ok_or_else(|| damaged("maps", &format!("{a} to {b} is gone")))?;
+                maps.push((from, to, IncomingMap::of_row(row)?));
+            }
+        }
+        Ok(maps)
+    }
+
+    /// The representatives with their pins and with the labels discovered on them.
+    fn members(&self, known: Vec<Known>, labels: &[LabelId]) -> Result<Vec<Member>> {
+        let mut members = Vec::with_capacity(known.len());
+        for (at, known) in self.chosen.iter().zip(known) {
+            let shape = &self.collection.shapes()[*at];
+            let pins = self.pins(*at)?;
+            let version = self.supervision.discovered().version_of(shape.ordinal);
+            let discovered = match version.filter(|_| !self.supervision.is_closed()) {
+                Some(version) => self.discovered_probabilities(&known, version, labels)?,
+                None => Vec::new(),
+            };
+            members.push(Member {
+                at: *at,
+                pinned_classes: pinned_faces(&known.view(), &pins, labels),
+                known,
+                pins,
+                discovered,
+            });
+        }
+        Ok(members)
+    }
+
+    fn pins(&self, at: usize) -> Result<Vec<i32>> {
+        let shape = &self.collection.shapes()[at];
+        match shape.pinned {
+            true => pins_of(self.sources, shape.id),
+            false => Ok(Vec::new()),
+        }
+    }
+
+    /// Probabilities `(m, k)` of discovered labels, as of when discovery ended.
+    fn discovered_probabilities(
+        &self,
+        known: &Known,
+        version: u64,
+        labels: &[LabelId],
+    ) -> Result<Vec<u8>> {
+        let id = known.row.id;
+        let old = self.sources.labels_at(id, version)?;
+        let gone = || {
+            damaged(
+                "label_versions",
+                &format!("version {version} of {id} is gone"),
+            )
+        };
+        let old = old.ok_or_else(gone)?;
+        let n_old = self.supervision.discovered().labels.len();
+        let resolved = self.resolved_discovered()?;
+        let column: Vec<Option<usize>> = resolved
+            .iter()
+            .map(|label| labels.iter().position(|l| l == label))
+            .collect();
+        let mut out = vec![0u8; known.view().faces.len() * labels.len()];
+        let rows = out.chunks_exact_mut(labels.len());
+        for (row, was) in rows.zip(old.proxy_probabilities.chunks_exact(n_old.max(1))) {
+            for (probability, column) in was.iter().zip(&column) {
+                if let Some(column) = column {
+                    row[*column] = row[*column].saturating_add(*probability);
+                }
+            }
+        }
+        Ok(out)
+    }
+
+    /// The discovered labels, as the labels they were merged into.
+    fn resolved_discovered(&self) -> Result<Vec<LabelId>> {
+        let rows = self.sources.labels(self.collection.id())?;
+        let labels = self.supervision.discovered().labels.iter();
+        Ok(labels.map(|label| resolved(&rows, *label)).collect())
+    }
+
+    /// Statistics of the pinned faces of training shapes that are no members, and of discovered
+    /// labels where those are still given.
+    fn evidence_elsewhere(&self, model: &LabelModel) -> Result<Statistics> {
+        let (k, dim) = (model.labels.len(), model.normalisation.mean.len());
+        let mut evidence = Statistics::empty(k, dim);
+        let options = TeachOptions::default();
+        for (at, shape) in self.collection.shapes().iter().enumerate() {
+            let is_training = shape.pinned && !self.chosen.contains(&at);
+            let version = self.supervision.discovered().version_of(shape.ordinal);
+            let version = version.filter(|_| !self.supervision.is_closed());
+            if !is_training && version.is_none() {
+                continue;
+            }
+            let known = self.sources.known(shape.id)?;
+            let shape = PreparedShape::new(known.view(), model);
+            let pinned = pinned_faces(&shape.view, &self.pins(at)?, &model.labels);
+            let of = |class: &dyn Fn(usize) -> Option<u32>| {
+                let prepared = &shape.prepared;
+                Statistics::of_shape(&prepared.features, &prepared.surface.area, class, k)
+            };
+            if is_training {
+                evidence.accumulate(&of(&|f| pinned[f]), options.pinned_weight);
+            }
+            if let Some(version) = version {
+                let old = self.discovered_probabilities(&known, version, &model.labels)?;
+                let most = |f: usize| {
+                    let row = &old[f * k..(f + 1) * k];
+                    let best = most_likely(row)?;
+                    let is_pinned = pinned.get(f).is_some_and(Option::is_some);
+                    (row[best] > 0 && !is_pinned).then_some(best as u32)
+                };
+                evidence.accumulate(&of(&most), 1.0);
+            }
+        }
+        Ok(evidence)
+    }
+
+    /// Statistics of the labels as they were when discovery ended, where shapes cannot carry those
+    /// labels any more; `None` also if there were fewer than two.
+    fn discovered_statistics(&self, model: &LabelModel) -> Result<Option<Statistics>> {
+        let k = self.supervision.discovered().labels.len();
+        if !self.supervision.is_closed() || k < 2 {
+            return Ok(None);
+        }
+        let mut discovered = Statistics::empty(k, model.normalisation.mean.len());
+        for (ordinal, version) in &self.supervision.discovered().versions {
+            // Shapes may have been removed since, and old versions are not stored for ever.
+            let shapes = self.collection.shapes();
+            let Some(shape) = shapes.iter().find(|s| s.ordinal == *ordinal) else {
+                continue;
+            };
+            let Some(old) = self.sources.labels_at(shape.id, *version)? else {
+                continue;
+            };
+            let known = self.sources.known(shape.id)?;
+            let prepared = Prepared::new(&known.view(), model);
+            let most = |f: usize| {
+                let row = &old.proxy_probabilities[f * k..(f + 1) * k];
+                most_likely(row).map(|l| l as u32)
+            };
+            let (features, area) = (&prepared.features, &prepared.surface.area);
+            discovered.accumulate(&Statistics::of_shape(features, area, most, k), 1.0);
+        }
+        Ok((discovered.total() > 0.0).then_some(discovered))
+    }
+}
+
+/// The class of the highest probability; of equal ones the first.
+fn most_likely(row: &[u8]) -> Option<usize> {
+    (0..row.len()).max_by(|&a, &b| row[a].cmp(&row[b]).then(b.cmp(&a)))
+}
+
+/// The label that an id stands for, after merging.
+fn resolved(rows: &[LabelRow], id: LabelId) -> LabelId {
+    let into = |id: LabelId| rows.iter().find(|l| l.id == id).and_then(|l| l.merged_into);
+    let mut id = id;
+    // Chains are as long as there are labels at most.
+    for _ in 0..rows.len() {
+        match into(id) {
+            Some(next) => id = next,
+            None => break,
+        }
+    }
+    id
+}

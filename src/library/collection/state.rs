@@ -1,0 +1,228 @@
+//! What decides how a collection is labelled next: its regime, and the changes of regime.
+
+use super::up::{UpFound, UpState};
+use crate::library::types::LabelId;
+
+/// The state of a collection besides its model and its shapes.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(in crate::library) struct State {
+    /// Number of shapes at which the parts are clustered again, or the model is fitted again.
+    pub(in crate::library) next_recluster: u64,
+    /// The epoch of discovery: the one in force, or the last one before a person labelled faces.
+    pub(in crate::library) epoch: Epoch,
+    /// Where labels come from.
+    pub(in crate::library) regime: Regime,
+    /// The estimate, where the up axis is estimated.
+    pub(in crate::library) up: Option<UpState>,
+    /// Where the up axis is given: another one along which shapes stand clearly better.
+    pub(in crate::library) up_disagrees: Option<UpState>,
+    /// The newest job that propagates a correction.
+    pub(in crate::library) propagation: Option<Propagation>,
+}
+
+impl State {
+    /// The same state, with what shapes show of the up axis.
+    pub(in crate::library) fn with_up(self, found: &UpFound) -> Self {
+        Self {
+            up: found.estimate,
+            up_disagrees: found.disagrees,
+            ..self
+        }
+    }
+}
+
+/// The time from one accepted re-clustering to the next.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(in crate::library) struct Epoch {
+    /// Ordinals of the shapes that were clustered together when it began.
+    pub(in crate::library) representatives: Vec<u64>,
+    /// Newest ordinal when it began.
+    pub(in crate::library) last_ordinal: u64,
+    /// Ordinals of later shapes that do not inform the model: a correction labelled them that was
+    /// undone.
+    pub(in crate::library) silent: Vec<u64>,
+}
+
+impl Epoch {
+    /// Whether the labels of the shape with this ordinal are part of the model.
+    pub(in crate::library) fn informs(&self, ordinal: u64) -> bool {
+        let is_newer = ordinal > self.last_ordinal;
+        is_newer && !self.silent.contains(&ordinal) || self.representatives.contains(&ordinal)
+    }
+}
+
+/// The job in which a person's labels are propagated to the other shapes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::library) struct Propagation {
+    /// Its id.
+    pub(in crate::library) job: u64,
+    /// Shapes that were stale when it began.
+    pub(in crate::library) n_shapes: u64,
+}
+
+/// Where the labels of a collection come from.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(in crate::library) enum Regime {
+    /// Parts are clustered, and the collection is clustered again as it grows.
+    #[default]
+    Discovering,
+    /// A person changed labels: they follow from the training shapes, and nothing is clustered.
+    Supervised(Supervision),
+}
+
+/// How the labels of a collection follow from what persons labelled.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::library) struct Supervision {
+    vocabulary: Vocabulary,
+    phase: Phase,
+    trained: Vec<u64>,
+    discovered: Discovered,
+}
+
+/// Which labels shapes can carry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::library) enum Vocabulary {
+    /// Those that persons used, and those that were discovered before.
+    Open,
+    /// Those that persons used: a person labelled a whole shape.
+    Closed,
+}
+
+/// How far the model follows from the training shapes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::library) enum Phase {
+    /// Descriptors must be standardised over the shapes of the next fit.
+    Outdated,
+    /// Descriptors are standardised; maps and the fit itself remain to be computed.
+    Standardised,
+    /// The model is fitted.
+    Fitted,
+}
+
+/// Labels that were discovered before a person changed any.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(in crate::library) struct Discovered {
+    /// Ordinals of representatives, and the version of the labels that each had.
+    pub(in crate::library) versions: Vec<(u64, u64)>,
+    /// Label of each class in the probabilities of those versions.
+    pub(in crate::library) labels: Vec<LabelId>,
+}
+
+impl Discovered {
+    /// The version in which the shape with this ordinal had discovered labels.
+    pub(in crate::library) fn version_of(&self, ordinal: u64) -> Option<u64> {
+        let found = self.versions.iter().find(|v| v.0 == ordinal);
+        found.map(|v| v.1)
+    }
+}
+
+impl Regime {
+    /// What supervises the collection, if a person does.
+    pub(in crate::library) fn supervision(&self) -> Option<&Supervision> {
+        match self {
+            Self::Discovering => None,
+            Self::Supervised(supervision) => Some(supervision),
+        }
+    }
+}
+
+impl Supervision {
+    /// The end of discovery by a change that keeps model and labels: the model counts as fitted to
+    /// the representatives.
+    pub(in crate::library) fn renamed(discovered: Discovered) -> Self {
+        Self {
+            vocabulary: Vocabulary::Open,
+            phase: Phase::Fitted,
+            trained: discovered.versions.iter().map(|v| v.0).collect(),
+            discovered,
+        }
+    }
+
+    /// The end of discovery by labelled faces, to which a model must be fitted.
+    pub(in crate::library) fn begun(vocabulary: Vocabulary, discovered: Discovered) -> Self {
+        Self {
+            vocabulary,
+            phase: Phase::Outdated,
+            trained: Vec::new(),
+            discovered,
+        }
+    }
+
+    /// The training shapes have changed.
+    pub(in crate::library) fn outdated(self, vocabulary: Vocabulary) -> Self {
+        Self {
+            vocabulary,
+            phase: Phase::Outdated,
+            ..self
+        }
+    }
+
+    /// Other versions show the discovered labels from now on, and the model must be fitted to them.
+    pub(in crate::library) fn rediscovered(self, discovered: Discovered) -> Self {
+        Self {
+            phase: Phase::Outdated,
+            discovered,
+            ..self
+        }
+    }
+
+    /// The discovered labels are no evidence any more.
+    pub(in crate::library) fn without_discovered(self) -> Self {
+        Self {
+            discovered: Discovered::default(),
+            ..self
+        }
+    }
+
+    /// Descriptors are standardised.
+    pub(in crate::library) fn standardised(self) -> Self {
+        Self {
+            phase: match self.phase {
+                Phase::Outdated => Phase::Standardised,
+                phase => phase,
+            },
+            ..self
+        }
+    }
+
+    /// The model is fitted to the shapes with these ordinals.
+    pub(in crate::library) fn fitted(self, trained: Vec<u64>) -> Self {
+        Self {
+            phase: Phase::Fitted,
+            trained,
+            ..self
+        }
+    }
+
+    /// A supervision as it was stored.
+    pub(super) fn stored(
+        vocabulary: Vocabulary,
+        phase: Phase,
+        trained: Vec<u64>,
+        discovered: Discovered,
+    ) -> Self {
+        Self {
+            vocabulary,
+            phase,
+            trained,
+            discovered,
+        }
+    }
+
+    pub(in crate::library) fn phase(&self) -> Phase {
+        self.phase
+    }
+
+    /// Ordinals of the shapes that the model was fitted to; their labels vote.
+    pub(in crate::library) fn trained(&self) -> &[u64] {
+        &self.trained
+    }
+
+    pub(in crate::library) fn discovered(&self) -> &Discovered {
+        &self.discovered
+    }
+
+    pub(in crate::library) fn is_closed(&self) -> bool {
+        self.vocabulary == Vocabulary::Closed
+    }
+}

@@ -1,0 +1,171 @@
+//! The state of a collection as the catalog stores it, and back. The names and their order are
+//! those of the first release, so that every library reads and writes the same text.
+
+use super::state::{Discovered, Epoch, Phase, Propagation, Regime, State, Supervision, Vocabulary};
+use super::up::UpState;
+use crate::library::error::Result;
+use crate::library::rows::{damaged, from_json, to_json};
+use crate::store::CollectionRow;
+use serde::{Deserialize, Serialize};
+
+/// A [`State`] as JSON.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(in crate::library) struct StoredState {
+    next_recluster: u64,
+    representatives: Vec<u64>,
+    epoch_ordinal: u64,
+    #[serde(default)]
+    silent: Vec<u64>,
+    #[serde(default)]
+    teaching: Option<StoredSupervision>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    up: Option<UpState>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    up_disagrees: Option<UpState>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    carrying: Option<StoredPropagation>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct StoredPropagation {
+    job: u64,
+    n_shapes: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct StoredSupervision {
+    pending: bool,
+    normalised: bool,
+    closed: bool,
+    taught: Vec<u64>,
+    discovered: Vec<(u64, u64)>,
+    discovered_labels: Vec<u32>,
+}
+
+impl State {
+    /// The state in a collection's row; the state of a new collection, where there is none yet.
+    pub(in crate::library) fn of(row: &CollectionRow) -> Result<Self> {
+        let location = format!("collections {}", row.name);
+        if row.state.is_empty() {
+            return Ok(Self::default());
+        }
+        let text = std::str::from_utf8(&row.state);
+        let text = text.map_err(|e| damaged(&location, &e.to_string()))?;
+        Ok(from_json::<StoredState>(text, &location)?.into())
+    }
+
+    /// The bytes for a collection's row.
+    pub(in crate::library) fn encode(&self) -> Vec<u8> {
+        to_json(&StoredState::from(self.clone())).into_bytes()
+    }
+}
+
+impl From<StoredState> for State {
+    fn from(stored: StoredState) -> Self {
+        Self {
+            next_recluster: stored.next_recluster,
+            epoch: Epoch {
+                representatives: stored.representatives,
+                last_ordinal: stored.epoch_ordinal,
+                silent: stored.silent,
+            },
+            regime: stored.teaching.map_or(Regime::Discovering, |teaching| {
+                Regime::Supervised(teaching.into())
+            }),
+            up: stored.up,
+            up_disagrees: stored.up_disagrees,
+            propagation: stored.carrying.map(|c| Propagation {
+                job: c.job,
+                n_shapes: c.n_shapes,
+            }),
+        }
+    }
+}
+
+impl From<State> for StoredState {
+    fn from(state: State) -> Self {
+        Self {
+            next_recluster: state.next_recluster,
+            representatives: state.epoch.representatives,
+            epoch_ordinal: state.epoch.last_ordinal,
+            silent: state.epoch.silent,
+            teaching: state.regime.supervision().map(StoredSupervision::from),
+            up: state.up,
+            up_disagrees: state.up_disagrees,
+            carrying: state.propagation.map(|p| StoredPropagation {
+                job: p.job,
+                n_shapes: p.n_shapes,
+            }),
+        }
+    }
+}
+
+impl From<StoredSupervision> for Supervision {
+    fn from(stored: StoredSupervision) -> Self {
+        let vocabulary = match stored.closed {
+            true => Vocabulary::Closed,
+            false => Vocabulary::Open,
+        };
+        let phase = match (stored.pending, stored.normalised) {
+            (false, _) => Phase::Fitted,
+            (true, false) => Phase::Outdated,
+            (true, true) => Phase::Standardised,
+        };
+        let discovered = Discovered {
+            versions: stored.discovered,
+            labels: stored.discovered_labels,
+        };
+        Self::stored(vocabulary, phase, stored.taught, discovered)
+    }
+}
+
+impl From<&Supervision> for StoredSupervision {
+    fn from(supervision: &Supervision) -> Self {
+        Self {
+            pending: supervision.phase() != Phase::Fitted,
+            normalised: supervision.phase() != Phase::Outdated,
+            closed: supervision.is_closed(),
+            taught: supervision.trained().to_vec(),
+            discovered: supervision.discovered().versions.clone(),
+            discovered_labels: supervision.discovered().labels.clone(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{State, StoredState};
+    use crate::library::rows::{from_json, to_json};
+
+    /// Texts as earlier releases wrote them; the last two lack what came later.
+    #[test]
+    fn states_are_written_as_they_were_read() {
+        for (text, is_old) in [
+            (
+                r#"{"next_recluster":5,"representatives":[1,2,4],"epoch_ordinal":4,"silent":[3],"teaching":null,"up":{"axis":[0.0,1.0,0.0],"agreement":0.75}}"#,
+                false,
+            ),
+            (
+                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":true,"normalised":false,"closed":true,"taught":[1,2],"discovered":[[1,3]],"discovered_labels":[0,2]},"carrying":{"job":9,"n_shapes":4}}"#,
+                false,
+            ),
+            (
+                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":true,"normalised":true,"closed":false,"taught":[],"discovered":[],"discovered_labels":[]}}"#,
+                false,
+            ),
+            (
+                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":false,"normalised":true,"closed":false,"taught":[],"discovered":[],"discovered_labels":[]}}"#,
+                false,
+            ),
+            (
+                r#"{"next_recluster":2,"representatives":[1],"epoch_ordinal":1}"#,
+                true,
+            ),
+        ] {
+            let stored: StoredState = from_json(text, "a test").expect("reads");
+            let again = StoredState::from(State::from(stored.clone()));
+            assert_eq!(again, stored);
+            assert_eq!(to_json(&again) == text, !is_old, "{}", to_json(&again));
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! Faces that a person labelled: the classes they pin, and the labels that persons use.
+
+use super::collection::Collection;
+use super::collection::state::Vocabulary;
+use super::error::Result;
+use super::rows::damaged;
+use super::sources::{Known, Sources};
+use super::types::LabelId;
+use crate::pipeline::{DescriptionView, proxy_pins};
+use crate::segmentation::Surface;
+use crate::store::{LabelVersionRow, ShapeId};
+use std::collections::{BTreeSet, VecDeque};
+
+/// Share of a shape's area that a person must have labelled for the shape to show which labels
+/// there are.
+const WHOLE: f64 = 0.9;
+
+/// Labels that persons used, and whether they are all there is.
+#[derive(Debug)]
+pub(super) struct UsedLabels {
+    pub(super) labels: BTreeSet<LabelId>,
+    pub(super) vocabulary: Vocabulary,
+}
+
+/// A stored shape whose pins are about to change.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Instead<'a> {
+    /// It has these pins.
+    Pinned(&'a Known, &'a [i32]),
+    /// It is removed.
+    Removed(ShapeId),
+}
+
+/// The labels that persons used in a collection, given the change of one shape.
+pub(super) fn used_labels(
+    collection: &Collection,
+    sources: &dyn Sources,
+    instead: Option<Instead<'_>>,
+) -> Result<UsedLabels> {
+    let changed = match instead {
+        Some(Instead::Pinned(known, _)) => Some(known.row.id),
+        Some(Instead::Removed(id)) => Some(id),
+        None => None,
+    };
+    let mut labels = BTreeSet::new();
+    let mut vocabulary = Vocabulary::Open;
+    let mut take = |view: &DescriptionView<'_>, pins: &[i32]| {
+        labels.extend(pins.iter().filter_map(|p| u32::try_from(*p).ok()));
+        if pinned_share(view, pins) >= WHOLE {
+            vocabulary = Vocabulary::Closed;
+        }
+    };
+    let pinned = collection.shapes().iter().filter(|s| s.pinned);
+    for shape in pinned.filter(|s| Some(s.id) != changed) {
+        take(
+            &sources.known(shape.id)?.view(),
+            &pins_of(sources, shape.id)?,
+        );
+    }
+    if let Some(Instead::Pinned(known, pins)) = instead {
+        take(&known.view(), pins);
+    }
+    Ok(UsedLabels { labels, vocabulary })
+}
+
+/// The pins of a shape that a person labelled.
+pub(super) fn pins_of(sources: &dyn Sources, id: ShapeId) -> Result<Vec<i32>> {
+    let pins = sources.pins(id)?;
+    pins.ok_or_else(|| damaged("pins", &format!("row {id} is gone")))
+}
+
+/// Share of the area of a shape that is pinned.
+pub(super) fn pinned_share(view: &DescriptionView<'_>, pins: &[i32]) -> f64 {
+    let area = view.polygon_area.iter().map(|a| f64::from(*a));
+    let total: f64 = area.clone().sum();
+    let pinned: f64 = area
+        .zip(pins)
+        .filter(|(_, p)| **p >= 0)
+        .map(|(a, _)| a)
+        .sum();
+    pinned / total.max(1e-300)
+}
+
+/// Class of each proxy face `(m,)` that a person labelled, given the pins `(n_polygons,)` and the
+/// label of each class; empty if nothing is pinned. If the whole shape is labelled, every proxy
+/// face is: one that stands for no polygon takes the class of the nearest face that does, so that
+/// no face keeps a label that nobody gave.
+pub(super) fn pinned_faces<L: Copy + Into<i64>>(
+    view: &DescriptionView<'_>,
+    pins: &[i32],
+    labels: &[L],
+) -> Vec<Option<u32>> {
+    if pins.is_empty() {
+        return Vec::new();
+    }
+    let class = |pin: &i32| {
+        let found = labels.iter().position(|l| (*l).into() == i64::from(*pin));
+        found.map(|c| c as u32)
+    };
+    let of_polygon: Vec<Option<u32>> = pins.iter().map(class).collect();
+    let mut classes = proxy_pins(view, &of_polygon, labels.len());
+    if pins.iter().all(|p| *p >= 0) && classes.iter().any(Option::is_none) {
+        spread(&Surface::new(&view.mesh()), &mut classes);
+    }
+    classes
+}
+
+/// Gives each face without a class that of the nearest face with one, counted in steps over edges
+/// and bridges; of faces equally near, that of the one that was reached first, by ascending index.
+fn spread(surface: &Surface, classes: &mut [Option<u32>]) {
+    let mut neighbours = vec![Vec::new(); classes.len()];
+    for edge in &surface.edges {
+        let [a, b] = edge.faces;
+        neighbours[a as usize].push(b);
+        neighbours[b as usize].push(a);
+    }
+    let with_class = (0..classes.len() as u32).filter(|f| classes[*f as usize].is_some());
+    let mut reached: VecDeque<u32> = with_class.collect();
+    while let Some(face) = reached.pop_front() {
+        for next in &neighbours[face as usize] {
+            if classes[*next as usize].is_none() {
+                classes[*next as usize] = classes[face as usize];
+                reached.push_back(*next);
+            }
+        }
+    }
+}
+
+/// Puts the labels that a person gave in the place of those that were found.
+pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
+    let slots = row
+        .polygon_labels
+        .iter_mut()
+        .zip(&mut row.polygon_confidence);
+    for ((label, confidence), pin) in slots.zip(pins) {
+        if *pin >= 0 {
+            *label = *pin;
+            *confidence = u8::MAX;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::spread;
+    use crate::mesh::icosphere;
+    use crate::segmentation::Surface;
+
+    #[test]
+    fn faces_without_a_class_take_that_of_the_nearest_face() {
+        let surface = Surface::new(&icosphere(2));
+        let mut classes = vec![None; surface.n_faces()];
+        spread(&surface, &mut classes);
+        assert!(classes.iter().all(Option::is_none), "nothing to spread");
+        // Two opposite faces: each takes the half that it is in, up to the size of a face.
+        let far = |a: usize, b: usize| -> f64 {
+            let (a, b) = (surface.centroids[a], surface.centroids[b]);
+            (0..3).map(|i| (a[i] - b[i]).powi(2)).sum()
+        };
+        let opposite = (0..classes.len()).max_by(|a, b| far(0, *a).total_cmp(&far(0, *b)));
+        let opposite = opposite.unwrap();
+        (classes[0], classes[opposite]) = (Some(4), Some(7));
+        spread(&surface, &mut classes);
+        for (f, class) in classes.iter().enumerate() {
+            let (here, there) = (far(0, f).sqrt(), far(opposite, f).sqrt());
+            match class {
+                Some(4) => assert!(here < there + 0.3, "{here} {there}"),
+                Some(7) => assert!(there < here + 0.3, "{here} {there}"),
+                other => panic!("face {f} has {other:?}"),
+            }
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! Stored shapes vote for the labels of another one, through functional maps.
+
+use super::collection::Collection;
+use super::error::Result;
+use super::rows::confidence_of_row;
+use super::sources::{Known, Sources};
+use super::types::Source;
+use crate::fmap::{Confidence, FunctionalMap, MapOptions};
+use crate::labels::LabelModel;
+use crate::pipeline::{DescriptionView, Labelling, Prepared, Vote, map, map_from, unlikeness};
+use crate::store::{MapRow, ShapeId};
+use rayon::prelude::*;
+
+/// A shape with what labelling derives from it under a label model.
+#[derive(Debug)]
+pub(super) struct PreparedShape<'a> {
+    pub(super) view: DescriptionView<'a>,
+    pub(super) prepared: Prepared,
+}
+
+impl<'a> PreparedShape<'a> {
+    pub(super) fn new(view: DescriptionView<'a>, model: &LabelModel) -> Self {
+        let prepared = Prepared::new(&view, model);
+        Self { view, prepared }
+    }
+
+    /// Computes the functional map from this shape to another.
+    pub(super) fn map_to(&self, to: &PreparedShape<'_>) -> FunctionalMap {
+        let options = MapOptions::default();
+        map(
+            (&self.view, &self.prepared),
+            (&to.view, &to.prepared),
+            &options,
+        )
+    }
+
+    /// [`Self::map_to`], grown from a given map `c_12 (k, k1)` in place of nearest neighbours of
+    /// descriptors.
+    pub(super) fn map_grown_from(
+        &self,
+        to: &PreparedShape<'_>,
+        start: (&[f32], usize),
+    ) -> FunctionalMap {
+        let options = MapOptions::default();
+        let (one, two) = ((&self.view, &self.prepared), (&to.view, &to.prepared));
+        map_from(one, two, start, &options)
+    }
+}
+
+/// A labelling of a new shape, the maps that votes came through, and the shapes that voted.
+#[derive(Debug)]
+pub(super) struct Voted {
+    pub(super) labelling: Labelling,
+    pub(super) sources: Vec<Source>,
+    /// By the shape that each comes from.
+    pub(super) maps: Vec<(ShapeId, FunctionalMap)>,
+}
+
+impl Voted {
+    pub(super) fn new(labelling: Labelling, voters: &[Voter], maps: Vec<FunctionalMap>) -> Self {
+        Self {
+            sources: sources_of(voters, &labelling.weights),
+            maps: voters.iter().map(|v| v.known.row.id).zip(maps).collect(),
+            labelling,
+        }
+    }
+
+    /// The labelling, the shapes that voted, and the maps; none where nothing could vote yet.
+    pub(super) fn parts(
+        voted: Option<Self>,
+    ) -> (
+        Option<Labelling>,
+        Vec<Source>,
+        Vec<(ShapeId, FunctionalMap)>,
+    ) {
+        match voted {
+            Some(v) => (Some(v.labelling), v.sources, v.maps),
+            None => (None, Vec::new(), Vec::new()),
+        }
+    }
+}
+
+/// A stored shape that votes.
+#[derive(Debug)]
+pub(super) struct Voter {
+    pub(super) known: Known,
+    /// Its label probabilities; `None`: those of its newest labels.
+    probabilities: Option<Vec<u8>>,
+    /// Weight of its vote against that of a shape whose labels were propagated.
+    trust: f64,
+}
+
+impl Voter {
+    /// A shape that votes with its newest labels. Where those were computed by a model of another
+    /// epoch, whose classes may be others, the labels themselves count instead of probabilities.
+    pub(super) fn new(known: Known, model: &LabelModel) -> Self {
+        Self::training(known, None, 1.0, model)
+    }
+
+    /// A shape that votes with its newest labels or with other probabilities, and is trusted.
+    pub(super) fn training(
+        known: Known,
+        probabilities: Option<Vec<u8>>,
+        trust: f64,
+        model: &LabelModel,
+    ) -> Self {
+        let (labels, k) = (&known.labels, model.labels.len());
+        let is_current = known.row.label_epoch == model.epoch
+            && labels.proxy_probabilities.len() == labels.proxy_labels.len() * k;
+        let class = |id: &i32| {
+            let found = model
+                .labels
+                .iter()
+                .position(|l| i64::from(*l) == i64::from(*id));
+            found.map(|c| c as u32)
+        };
+        let probabilities = match probabilities {
+            None if !is_current => {
+                let classes: Vec<Option<u32>> = labels.proxy_labels.iter().map(class).collect();
+                Some(one_hot(&classes, k))
+            }
+            probabilities => probabilities,
+        };
+        Self {
+            known,
+            probabilities,
+            trust,
+        }
+    }
+}
+
+/// Probabilities `(m, k)` of given classes, and zeros for faces without one.
+pub(super) fn one_hot(classes: &[Option<u32>], k: usize) -> Vec<u8> {
+    let mut out = vec![0; classes.len() * k];
+    for (row, class) in out.chunks_exact_mut(k).zip(classes) {
+        if let Some(class) = class {
+            row[*class as usize] = u8::MAX;
+        }
+    }
+    out
+}
+
+/// What votes need of a map to the shape that is labelled.
+#[derive(Debug, Clone)]
+pub(super) struct IncomingMap {
+    p2p_21: Vec<u32>,
+    confidence: Confidence,
+}
+
+impl IncomingMap {
+    pub(super) fn of_row(row: MapRow) -> Result<Self> {
+        Ok(Self {
+            confidence: confidence_of_row(&row)?,
+            p2p_21: row.p2p_21,
+        })
+    }
+
+    /// For each vertex of the shape that is labelled a vertex of the voter.
+    pub(super) fn p2p_21(&self) -> &[u32] {
+        &self.p2p_21
+    }
+
+    pub(super) fn confidence(&self) -> &Confidence {
+        &self.confidence
+    }
+}
+
+impl From<&FunctionalMap> for IncomingMap {
+    fn from(map: &FunctionalMap) -> Self {
+        Self {
+            p2p_21: map.p2p_21.clone(),
+            confidence: map.confidence.clone(),
+        }
+    }
+}
+
+/// One vote for each voter and its map.
+pub(super) fn votes<'a>(voters: &'a [Voter], maps: &'a [IncomingMap]) -> Vec<Vote<'a>> {
+    let vote = |(voter, map): (&'a Voter, &'a IncomingMap)| Vote {
+        faces: voter.known.view().faces,
+        probabilities: match &voter.probabilities {
+            Some(probabilities) => probabilities,
+            None => &voter.known.labels.proxy_probabilities,
+        },
+        p2p: &map.p2p_21,
+        confidence: &map.confidence,
+        trust: voter.trust,
+    };
+    voters.iter().zip(maps).map(vote).collect()
+}
+
+/// The voters as the sources of a labelling, with the weights of their votes.
+pub(super) fn sources_of(voters: &[Voter], weights: &[f64]) -> Vec<Source> {
+    let source = |(voter, weight): (&Voter, &f64)| Source {
+        shape: voter.known.row.name.clone(),
+        version: voter.known.row.version,
+        weight: *weight,
+    };
+    voters.iter().zip(weights).map(source).collect()
+}
+
+/// Computes the map from a stored shape to another one.
+pub(super) fn new_map(from: &Known, to: &PreparedShape<'_>, model: &LabelModel) -> FunctionalMap {
+    PreparedShape::new(from.view(), model).map_to(to)
+}
+
+/// Computes the map from each voter to a shape.
+pub(super) fn new_maps(
+    voters: &[Voter],
+    to: &PreparedShape<'_>,
+    model: &LabelModel,
+) -> Vec<FunctionalMap> {
+    let maps = voters.par_iter().map(|v| new_map(&v.known, to, model));
+    maps.collect()
+}
+
+/// The `limit` shapes among some whose maps to a shape promise most, best first: twice as many are
+/// taken by their signatures, and compared vertex by vertex.
+pub(super) fn rank_candidates(
+    collection: &Collection,
+    sources: &dyn Sources,
+    view: &DescriptionView<'_>,
+    among: &[usize],
+    limit: usize,
+) -> Result<Vec<usize>> {
+    let nearest = collection.nearest_among(among, view.signature, view.n_descriptors, 2 * limit);
+    let nearest: Vec<usize> = nearest.into_iter().map(|(at, _)| at).collect();
+    let Some(model) = collection.label_model().filter(|_| nearest.len() > limit) else {
+        return Ok(nearest);
+    };
+    let shape = Prepared::new(view, model);
+    let mut found = Vec::with_capacity(nearest.len());
+    for at in nearest {
+        let known = sources.known(collection.shapes()[at].id)?;
+        let known = Prepared::new(&known.view(), model);
+        found.push((unlikeness(&known, &shape), at));
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    found.truncate(limit);
+    Ok(found.into_iter().map(|(_, at)| at).collect())
+}
