@@ -4,9 +4,7 @@
 
 use super::error::{LibraryError, Result};
 use super::refusal::refusal;
-use super::rows::{
-    format_from_name, operator_from_name, operator_name, report_from_json, report_to_json,
-};
+use super::rows::{format_from_name, operator_from_name, operator_name};
 use super::types::Failure;
 use crate::mesh::{CleanReport, Format};
 use crate::pipeline::{Description, Params, describe};
