@@ -12,7 +12,7 @@ use crate::ipc::frames::FrameReader;
 use crate::ipc::size::in_words;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply};
 use crate::library::{
-    Job, KeptShapes, LibraryError, NewShape, RequestKey, Submission, check_shape_name,
+    Job, LibraryError, NewShape, RequestKey, StoredOriginals, Submission, check_shape_name,
 };
 use bytes::Bytes;
 use std::sync::Arc;
@@ -73,7 +73,7 @@ impl Drop for Room {
 pub(crate) struct Addition {
     request: wire::AddShapesRequest,
     key: Option<RequestKey>,
-    shapes: KeptShapes,
+    shapes: StoredOriginals,
     room: Room,
 }
 
@@ -108,7 +108,7 @@ pub(crate) fn store_originals(
     for input in &inputs {
         check_shape_name(&input.name).map_err(refused)?;
     }
-    let mut shapes = KeptShapes::new();
+    let mut shapes = StoredOriginals::new();
     // One after the other, so that only one file is in memory.
     for (input, length) in inputs.into_iter().zip(n_bytes) {
         let bytes = match input.source {
@@ -122,7 +122,9 @@ pub(crate) fn store_originals(
             replace: input.replace,
         };
         let library = &daemon.library;
-        library.keep_another(&mut shapes, shape).map_err(refused)?;
+        library
+            .store_another_original(&mut shapes, shape)
+            .map_err(refused)?;
     }
     Ok(Addition {
         request,

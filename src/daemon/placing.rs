@@ -163,7 +163,8 @@ fn place_remotely(
         // Recording a failure needs no worker.
         Err(why) => return library.place_item(item, Err(why)),
     };
-    let placed = library.lend(&item.collection, || try_to_place(daemon, item, &described));
+    let placed =
+        library.with_exclusive(&item.collection, || try_to_place(daemon, item, &described));
     match placed {
         Ok(Ok(Ok(()))) => library.item_state(item),
         Ok(Ok(Err(why))) => library.place_item(item, Err(why)),
@@ -182,7 +183,7 @@ fn try_to_place(
     described: &Described,
 ) -> Result<Result<(), Failure>, LibraryError> {
     let library = &daemon.library;
-    let ticket = library.hand_over(item, described)?;
+    let ticket = library.placement_ticket(item, described)?;
     let n_bytes = library.item_bytes(item)?;
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
@@ -339,7 +340,8 @@ fn relabel_remotely(
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let wanted = || begin.elapsed() < limit;
     let work = Placing::Relabel(collection);
-    let report = library.lend(collection, || daemon.pool.place(collection, work, &wanted))?;
+    let report =
+        library.with_exclusive(collection, || daemon.pool.place(collection, work, &wanted))?;
     match report {
         Ok(report) => match outcome(daemon, &report)? {
             worker::Outcome::Relabelled(again) => Ok(Ok(again)),

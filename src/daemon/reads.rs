@@ -115,13 +115,13 @@ fn stored_map(
     let (collection, from, to) = (&r.collection, &r.from, &r.to);
     let found = match &r.points {
         Some(points) => library
-            .kept_point_maps(collection, from, to, &convert::point_request(points))
+            .stored_point_maps(collection, from, to, &convert::point_request(points))
             .map_err(refused)?
             .map(|maps| convert::point_maps(&maps, frames)),
         // The comparison with the other maps must be computed.
         None if r.agreement => None,
         None => library
-            .kept_map(collection, from, to)
+            .stored_map(collection, from, to)
             .map_err(refused)?
             .map(|map| convert::functional_map(&map, frames)),
     };
@@ -211,7 +211,7 @@ pub(crate) fn job_to_wire(daemon: &Daemon, job: &Job) -> wire::Job {
         .iter()
         .filter(|i| convert::job_finished(&i.state))
         .count();
-    if let Some(carrying) = job.carrying {
+    if let Some(carrying) = job.propagation {
         return convert::carrying_job(job, &carrying);
     }
     wire::Job {

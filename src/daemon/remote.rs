@@ -48,7 +48,10 @@ pub(crate) fn edit(
         let _permit = runtime.block_on(daemon.capacity.editing.acquire());
         run(daemon, Remote::Edit(edit), frames, key, &|| true)
     };
-    let made = daemon.library.lend(&collection, make).map_err(refused)?;
+    let made = daemon
+        .library
+        .with_exclusive(&collection, make)
+        .map_err(refused)?;
     // Also after a failure: a worker may have ended just after the commit.
     daemon.notice(Notice::Changed(collection.clone()));
     daemon.nudge(&collection);

@@ -101,7 +101,7 @@ impl Library {
     ///
     /// # Errors
     /// There is no such collection.
-    pub fn lend<T>(&self, collection: &str, work: impl FnOnce() -> T) -> Result<T> {
+    pub fn with_exclusive<T>(&self, collection: &str, work: impl FnOnce() -> T) -> Result<T> {
         let slot = self.slot(self.collection_row(collection)?.id);
         let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
         // The other process loads its own: one copy is enough.

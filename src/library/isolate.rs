@@ -4,9 +4,7 @@
 
 use super::error::{LibraryError, Result};
 use super::refusal::refusal;
-use super::rows::{
-    format_from_name, operator_from_name, operator_name, report_from_json, report_to_json,
-};
+use super::rows::{format_from_name, operator_from_name, operator_name};
 use super::types::Failure;
 use crate::mesh::{CleanReport, Format};
 use crate::pipeline::{Description, Params, describe};
@@ -62,7 +60,8 @@ struct Decoded(#[serde(with = "DescriptionFields")] Description);
 
 /// A report as its counts by name.
 mod report {
-    use super::{LOCATION, report_from_json, report_to_json};
+    use crate::library::isolate::LOCATION;
+    use crate::library::rows::{report_from_json, report_to_json};
     use crate::mesh::CleanReport;
     use serde::de::Error as _;
     use serde::{Deserialize as _, Deserializer, Serializer};

@@ -5,7 +5,7 @@ use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
 use super::reason::Reason;
 use super::rows::{damaged, from_json, to_json};
-use super::types::{Carrying, ItemState, Job, JobItem};
+use super::types::{ItemState, Job, JobItem, PropagationProgress};
 use crate::store::{ItemStatus, JobItemRow, ObjectKind, Tx};
 use serde::{Deserialize, Serialize};
 use std::sync::PoisonError;
@@ -39,19 +39,23 @@ pub struct JobFilter {
 impl Library {
     /// How far the correction of a job is propagated. Nothing remains to be done once the collection is
     /// deleted, or once a later change has taken its place.
-    pub(super) fn carrying(&self, job: u64, collection: &str) -> Result<Carrying> {
-        self.store.catalog().read(|r| -> Result<Carrying> {
-            let Some(row) = r.collection(collection)? else {
-                return Ok(Carrying::default());
-            };
-            let state = State::of(&row)?;
-            let newest = state.propagation.filter(|c| c.job == job);
-            let n_stale = r.n_stale(row.id)?;
-            Ok(newest.map_or_else(Carrying::default, |c| Carrying {
-                n_shapes: c.n_shapes,
-                n_left: n_stale.min(c.n_shapes),
-            }))
-        })
+    pub(super) fn propagation(&self, job: u64, collection: &str) -> Result<PropagationProgress> {
+        self.store
+            .catalog()
+            .read(|r| -> Result<PropagationProgress> {
+                let Some(row) = r.collection(collection)? else {
+                    return Ok(PropagationProgress::default());
+                };
+                let state = State::of(&row)?;
+                let newest = state.propagation.filter(|c| c.job == job);
+                let n_stale = r.n_stale(row.id)?;
+                Ok(
+                    newest.map_or_else(PropagationProgress::default, |c| PropagationProgress {
+                        n_shapes: c.n_shapes,
+                        n_left: n_stale.min(c.n_shapes),
+                    }),
+                )
+            })
     }
 
     pub(super) fn item_row(&self, item: &JobItem) -> Result<JobItemRow> {
@@ -106,8 +110,8 @@ impl Library {
             let job = job.ok_or_else(|| LibraryError::not_found(Named::Job, id.to_string()))?;
             Ok((job, r.job_items(id)?))
         })?;
-        let carrying = if items.is_empty() {
-            Some(self.carrying(id, &job.collection)?)
+        let propagation = if items.is_empty() {
+            Some(self.propagation(id, &job.collection)?)
         } else {
             None
         };
@@ -119,7 +123,7 @@ impl Library {
             id,
             collection: job.collection,
             items,
-            carrying,
+            propagation,
         })
     }
 
@@ -196,8 +200,8 @@ impl Library {
                 let is_carrying = items.is_empty();
                 let items = items.into_iter().filter(|i| is_listed(i.status));
                 Ok(Job {
-                    carrying: if is_carrying {
-                        Some(self.carrying(job.id, &job.collection)?)
+                    propagation: if is_carrying {
+                        Some(self.propagation(job.id, &job.collection)?)
                     } else {
                         None
                     },

@@ -74,14 +74,15 @@ pub use jobs::JobFilter;
 pub use names::{check_shape_name, shown};
 pub use points::{PointRequest, PolygonValues};
 pub use reason::{Code, Reason};
-pub use remote::{HandedOver, state_from_json, state_to_json};
+pub use remote::{PlacementTicket, state_from_json, state_to_json};
 pub use repair::Repaired;
 pub use rows::report_to_json;
-pub use submit::{Described, Describer, KeptShapes, Submission};
+pub use submit::{Described, Describer, StoredOriginals, Submission};
 pub use suggest::Suggestion;
 pub use types::{
-    Carrying, CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState,
-    Job, JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
-    PartInfo, PartMatch, Placed, RequestKey, ShapeInfo, Source, Up, UpEstimate,
+    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,
+    JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
+    PartInfo, PartMatch, Placed, PropagationProgress, RequestKey, ShapeInfo, Source, Up,
+    UpEstimate,
 };
 pub use upright::UpSet;

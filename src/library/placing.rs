@@ -100,7 +100,7 @@ impl Library {
     /// # Errors
     /// As [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
     pub fn add(&self, collection: &str, shape: ShapeToAdd) -> Result<Placed> {
-        let job = self.submit(collection, &self.keep(vec![shape])?, None)?;
+        let job = self.submit(collection, &self.store_originals(vec![shape])?, None)?;
         let item = &job.items[0];
         match self.place_item(item, self.describe_item(item, &|_| true))? {
             ItemState::Done(placed) => Ok(*placed),

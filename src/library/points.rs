@@ -51,7 +51,7 @@ impl Library {
         to: &str,
         request: &PointRequest,
     ) -> Result<Vec<PointMap>> {
-        if let Some(kept) = self.kept_point_maps(collection, from, to, request)? {
+        if let Some(kept) = self.stored_point_maps(collection, from, to, request)? {
             return Ok(kept);
         }
         let (_, a) = self.shape_row(collection, from)?;
@@ -76,7 +76,7 @@ impl Library {
     ///
     /// # Errors
     /// There is no such shape, or the map is damaged.
-    pub fn kept_point_maps(
+    pub fn stored_point_maps(
         &self,
         collection: &str,
         from: &str,

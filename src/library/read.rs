@@ -117,7 +117,7 @@ impl Library {
     /// # Errors
     /// There is no such shape, or the collection has no label model yet.
     pub fn map(&self, collection: &str, from: &str, to: &str) -> Result<MapInfo> {
-        if let Some(kept) = self.kept_map(collection, from, to)? {
+        if let Some(kept) = self.stored_map(collection, from, to)? {
             return Ok(kept);
         }
         let (_, a) = self.shape_row(collection, from)?;
@@ -142,7 +142,7 @@ impl Library {
     ///
     /// # Errors
     /// There is no such shape, or the map is damaged.
-    pub fn kept_map(&self, collection: &str, from: &str, to: &str) -> Result<Option<MapInfo>> {
+    pub fn stored_map(&self, collection: &str, from: &str, to: &str) -> Result<Option<MapInfo>> {
         let (_, a) = self.shape_row(collection, from)?;
         let (_, b) = self.shape_row(collection, to)?;
         let kept = self

@@ -1,4 +1,4 @@
-//! Placing in another process: the text that is handed to it, and the state that comes back.
+//! Placing in another process: the ticket that it gets, and the state that it returns.
 //!
 //! The other process opens the library beside the one that holds it, and commits by itself: a
 //! process that dies in the middle leaves what a crash leaves, which is nothing. The holder lends
@@ -18,11 +18,11 @@ use std::path::Path;
 use std::time::Instant;
 
 /// Where the other process's text came from, in errors.
-const PLACE: &str = "work handed over";
+const LOCATION: &str = "work handed over";
 
 /// A described shape, on disk, and the item it belongs to.
 #[derive(Debug, Serialize, Deserialize)]
-struct Handed {
+struct Ticket {
     job: u64,
     index: u32,
     collection: String,
@@ -37,17 +37,17 @@ struct Handed {
 /// The text that tells another process which shape to place. Its description stays on disk until this
 /// is dropped.
 #[derive(Debug)]
-pub struct HandedOver {
-    /// For [`Library::place_handed`].
+pub struct PlacementTicket {
+    /// For [`Library::place_ticket`].
     pub words: Value,
     _kept: Kept,
 }
 
-impl Handed {
+impl Ticket {
     fn object(&self) -> Result<ObjectRow> {
         let digest = |text: &str| -> Result<Digest> {
             text.parse()
-                .map_err(|e| damaged(PLACE, &format!("{text:?}: {e}")))
+                .map_err(|e| damaged(LOCATION, &format!("{text:?}: {e}")))
         };
         Ok(ObjectRow {
             kind: ObjectKind::Description,
@@ -72,7 +72,7 @@ impl Handed {
 
 impl Library {
     /// Opens the library in `dir` beside the process that holds it: the one that started this
-    /// process, and that lends it ([`Library::lend`]) each collection it is to change.
+    /// process, and that lends it ([`Library::with_exclusive`]) each collection it is to change.
     ///
     /// # Errors
     /// There is no library of this version's format, or it cannot be read.
@@ -80,12 +80,16 @@ impl Library {
         Ok(Self::over(Store::open_beside(dir)?))
     }
 
-    /// Makes a description durable, for [`Library::place_handed`] in another process, which is to
+    /// Makes a description durable, for [`Library::place_ticket`] in another process, which is to
     /// end before what this returns is dropped.
     ///
     /// # Errors
     /// The description cannot be stored.
-    pub fn hand_over(&self, item: &JobItem, described: &Described) -> Result<HandedOver> {
+    pub fn placement_ticket(
+        &self,
+        item: &JobItem,
+        described: &Described,
+    ) -> Result<PlacementTicket> {
         let begin = Instant::now();
         let object = self.store.objects().put_description(
             described.digest,
@@ -94,7 +98,7 @@ impl Library {
         )?;
         let mut stages_ms = described.stages_ms.clone();
         stages_ms.push(("store".to_owned(), begin.elapsed().as_secs_f64() * 1e3));
-        let handed = Handed {
+        let ticket = Ticket {
             job: item.job,
             index: item.index,
             collection: item.collection.clone(),
@@ -105,38 +109,38 @@ impl Library {
             blake3: object.blake3.to_string(),
             stages_ms,
         };
-        let words = serde_json::to_value(handed);
-        Ok(HandedOver {
+        let words = serde_json::to_value(ticket);
+        Ok(PlacementTicket {
             words: words.expect("invariant: strings and numbers are JSON"),
             _kept: object,
         })
     }
 
-    /// [`Library::place_item`] of a description that was handed over.
+    /// [`Library::place_item`] of the description that a ticket names.
     ///
     /// # Errors
     /// As for [`Library::place_item`]; the description cannot be read.
-    pub fn place_handed(&self, handed: &Value) -> Result<ItemState> {
-        let handed: Handed = from_json(&handed.to_string(), PLACE)?;
-        let object = handed.object()?;
+    pub fn place_ticket(&self, ticket: &Value) -> Result<ItemState> {
+        let ticket: Ticket = from_json(&ticket.to_string(), LOCATION)?;
+        let object = ticket.object()?;
         let mapped = self.store.objects().open_description(&object)?;
         let described = Described {
             description: mapped.to_description(),
             digest: object.digest,
             params_json: mapped.params_json().to_owned(),
-            stages_ms: handed.stages_ms.clone(),
+            stages_ms: ticket.stages_ms.clone(),
             stored: Some(object),
         };
-        self.place_item(&handed.item(), Ok(described))
+        self.place_item(&ticket.item(), Ok(described))
     }
 
-    /// The bytes of the mesh file that a handed description was made of.
+    /// The bytes of the mesh file of the shape that a ticket names.
     ///
     /// # Errors
     /// There is no such item, or its bytes cannot be read.
-    pub fn handed_bytes(&self, handed: &Value) -> Result<Vec<u8>> {
-        let handed: Handed = from_json(&handed.to_string(), PLACE)?;
-        let row = self.item_row(&handed.item())?;
+    pub fn ticket_bytes(&self, ticket: &Value) -> Result<Vec<u8>> {
+        let ticket: Ticket = from_json(&ticket.to_string(), LOCATION)?;
+        let row = self.item_row(&ticket.item())?;
         self.store.original(&row.item.original_digest)
     }
 
@@ -183,7 +187,7 @@ pub fn state_to_json(state: &ItemState) -> Value {
 /// # Errors
 /// The value is not what [`state_to_json`] makes.
 pub fn state_from_json(value: &Value) -> Result<ItemState> {
-    let other = || damaged(PLACE, &format!("{value} is no state"));
+    let other = || damaged(LOCATION, &format!("{value} is no state"));
     if let Some(word) = value.as_str() {
         return match word {
             "queued" => Ok(ItemState::Queued),
@@ -192,11 +196,11 @@ pub fn state_from_json(value: &Value) -> Result<ItemState> {
         };
     }
     if let Some(placed) = value.get("done") {
-        let placed = from_json(&placed.to_string(), PLACE)?;
+        let placed = from_json(&placed.to_string(), LOCATION)?;
         return Ok(ItemState::Done(Box::new(placed)));
     }
     let why = value.get("failed").ok_or_else(other)?;
-    Ok(ItemState::Failed(from_json(&why.to_string(), PLACE)?))
+    Ok(ItemState::Failed(from_json(&why.to_string(), LOCATION)?))
 }
 
 #[cfg(test)]
@@ -245,7 +249,11 @@ mod tests {
             };
             let [first, second] = holders.each_ref().map(|holder| {
                 let job = holder
-                    .submit("c", &holder.keep(vec![shape.clone()]).unwrap(), None)
+                    .submit(
+                        "c",
+                        &holder.store_originals(vec![shape.clone()]).unwrap(),
+                        None,
+                    )
                     .unwrap();
                 let described = holder.describe_item(&job.items[0], &|_| true).unwrap();
                 (job, described)
@@ -254,9 +262,11 @@ mod tests {
             holders[0]
                 .name_label("c", 0, &format!("part {n}"), None)
                 .ok();
-            let handed = holders[0].hand_over(&first.0.items[0], &first.1).unwrap();
+            let ticket = holders[0]
+                .placement_ticket(&first.0.items[0], &first.1)
+                .unwrap();
             let state = holders[0]
-                .lend("c", || beside.place_handed(&handed.words))
+                .with_exclusive("c", || beside.place_ticket(&ticket.words))
                 .unwrap();
             let state = state.unwrap();
             assert!(matches!(state, ItemState::Done(_)), "{state:?}");

@@ -36,13 +36,13 @@ pub struct Described {
 
 /// Shapes whose files are durable, and that count once they are submitted.
 #[derive(Debug, Default)]
-pub struct KeptShapes {
+pub struct StoredOriginals {
     objects: Vec<Kept>,
     items: Vec<NewJobItem>,
 }
 
-impl KeptShapes {
-    /// No shapes yet; [`Library::keep_another`] adds one after the other.
+impl StoredOriginals {
+    /// No shapes yet; [`Library::store_another_original`] adds one after the other.
     pub fn new() -> Self {
         Self::default()
     }
@@ -54,7 +54,7 @@ pub struct Submission<'a> {
     /// Where they are added.
     pub collection: &'a str,
     /// The shapes.
-    pub shapes: &'a KeptShapes,
+    pub shapes: &'a StoredOriginals,
     /// Whose request it is.
     pub key: Option<&'a RequestKey>,
 }
@@ -81,23 +81,27 @@ impl Library {
     ///
     /// # Errors
     /// A bad name; the disk.
-    pub fn keep(&self, shapes: Vec<NewShape>) -> Result<KeptShapes> {
+    pub fn store_originals(&self, shapes: Vec<NewShape>) -> Result<StoredOriginals> {
         for s in &shapes {
             check_shape_name(&s.name)?;
         }
-        let mut kept = KeptShapes::default();
+        let mut kept = StoredOriginals::default();
         for s in shapes {
-            self.keep_another(&mut kept, s)?;
+            self.store_another_original(&mut kept, s)?;
         }
         Ok(kept)
     }
 
-    /// Writes the file of one more shape, as [`Library::keep`] does, so that they need not be in
+    /// Writes the file of one more shape, as [`Library::store_originals`] does, so that they need not be in
     /// memory together.
     ///
     /// # Errors
     /// A bad name; the disk.
-    pub fn keep_another(&self, kept: &mut KeptShapes, shape: NewShape) -> Result<()> {
+    pub fn store_another_original(
+        &self,
+        kept: &mut StoredOriginals,
+        shape: NewShape,
+    ) -> Result<()> {
         check_shape_name(&shape.name)?;
         let object = self.store.objects().put_original(&shape.bytes)?;
         kept.items.push(NewJobItem {
@@ -118,7 +122,7 @@ impl Library {
     pub fn submit(
         &self,
         collection: &str,
-        shapes: &KeptShapes,
+        shapes: &StoredOriginals,
         key: Option<&RequestKey>,
     ) -> Result<Job> {
         let submission = Submission {

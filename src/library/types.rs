@@ -290,19 +290,19 @@ pub struct Job {
     /// Its shapes in order; none if it propagates a correction.
     pub items: Vec<JobItem>,
     /// How far the correction is propagated, if the job propagates one.
-    pub carrying: Option<Carrying>,
+    pub propagation: Option<PropagationProgress>,
 }
 
 /// How far a correction is propagated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Carrying {
+pub struct PropagationProgress {
     /// Shapes to which it is propagated; 0 once a later change has taken its place.
     pub n_shapes: u64,
     /// Shapes that wait for it.
     pub n_left: u64,
 }
 
-impl Carrying {
+impl PropagationProgress {
     /// Share that is done, 0 to 1.
     pub fn progress(&self) -> f64 {
         1.0 - self.n_left as f64 / self.n_shapes.max(1) as f64

@@ -55,20 +55,20 @@ fault(
     "R1", "r1-done-in-advance", "write down that a shape is placed before it is",
     "src/library/remote.rs", "it daemon::stages::kills_while_a_start_takes_up_what_a_kill_left_lose_nothing",
     (
-        "        self.place_item(&handed.item(), Ok(described))",
+        "        self.place_item(&ticket.item(), Ok(described))",
         """        if FAULT {
             let detail = r#"{"outcome":"Added","version":1,"sequence":1,"n_maps":0,"n_relabelled":0,"stages_ms":[]}"#;
             let done = crate::store::ItemStatus::Done;
             self.store.catalog().write(|tx| -> Result<()> {
-                Ok(tx.set_item(handed.job, handed.index, done, Some(detail))?)
+                Ok(tx.set_item(ticket.job, ticket.index, done, Some(detail))?)
             })?;
             std::thread::sleep(std::time::Duration::from_millis(300));
             let queued = crate::store::ItemStatus::Queued;
             self.store.catalog().write(|tx| -> Result<()> {
-                Ok(tx.set_item(handed.job, handed.index, queued, None)?)
+                Ok(tx.set_item(ticket.job, ticket.index, queued, None)?)
             })?;
         }
-        self.place_item(&handed.item(), Ok(described))""",
+        self.place_item(&ticket.item(), Ok(described))""",
     ),
 )
 # R2: crash images

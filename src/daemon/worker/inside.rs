@@ -250,9 +250,9 @@ fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
         }
         let ticket = &header["place"];
         if poisoned {
-            take_poison(&library.handed_bytes(ticket)?, "-placing");
+            take_poison(&library.ticket_bytes(ticket)?, "-placing");
         }
-        Ok(report::placed(&library.place_handed(ticket)?))
+        Ok(report::placed(&library.place_ticket(ticket)?))
     }));
     match placed {
         Ok(Ok(outcome)) => outcome,

@@ -4,7 +4,7 @@ use super::errors::{error, failure, field_error, frame_error};
 use crate::ipc::frames::FrameReader;
 use crate::ipc::size;
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, error::Subject, shape_input};
-use crate::library::{Carrying, ItemState, Job, JobItem, Outcome, Placed};
+use crate::library::{ItemState, Job, JobItem, Outcome, Placed, PropagationProgress};
 use crate::mesh::Format;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -56,7 +56,7 @@ impl Ingest {
 }
 
 /// A job in which a correction is carried.
-pub fn carrying_job(job: &Job, carrying: &Carrying) -> wire::Job {
+pub fn carrying_job(job: &Job, carrying: &PropagationProgress) -> wire::Job {
     let finished = carrying.n_left == 0;
     wire::Job {
         job_id: job.id,

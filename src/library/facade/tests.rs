@@ -59,7 +59,7 @@ fn add(library: &Library, name: &str, tiny: &Tiny, replace: bool) -> Result<Item
         format: Format::Off,
         replace,
     };
-    let job = library.submit(COLLECTION, &library.keep(vec![shape])?, None)?;
+    let job = library.submit(COLLECTION, &library.store_originals(vec![shape])?, None)?;
     let item = &job.items[0];
     let described = library.describe_item_by(item, &|_| true, &|_, _| Ok(tiny.description.clone()));
     library.place_item(item, described)

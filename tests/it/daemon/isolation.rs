@@ -183,7 +183,7 @@ fn attempts_are_counted_across_restarts() {
         replace: false,
     };
     let job = library
-        .submit("c", &library.keep(vec![shape]).unwrap(), None)
+        .submit("c", &library.store_originals(vec![shape]).unwrap(), None)
         .unwrap();
     for attempt in 1..=2 {
         assert_eq!(
