@@ -60,7 +60,8 @@ struct Decoded(#[serde(with = "DescriptionFields")] Description);
 
 /// A report as its counts by name.
 mod report {
-    use super::{LOCATION, report_from_json, report_to_json};
+    use crate::library::isolate::LOCATION;
+    use crate::library::rows::{report_from_json, report_to_json};
     use crate::mesh::CleanReport;
     use serde::de::Error as _;
     use serde::{Deserialize as _, Deserializer, Serializer};

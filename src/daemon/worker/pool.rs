@@ -28,8 +28,8 @@ const THREADS_PER_PROCESSOR: usize = 2;
 /// Work on a collection in a worker that opens the library.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Placing<'a> {
-    /// Place the shape of this ticket ([`crate::Library::placement_ticket`]), whose file has so many
-    /// bytes.
+    /// Place the shape of this ticket ([`crate::Library::placement_ticket`]), whose file has this
+    /// number of bytes.
     Place(&'a Value, u64),
     /// Relabel one stale shape of a collection.
     Relabel(&'a str),
