@@ -20,10 +20,8 @@ from setuptools.command.build_ext import build_ext
 from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
-try:
-    from setuptools._distutils.command.build_scripts import build_scripts
-except ImportError:
-    from distutils.command.build_scripts import build_scripts
+# That of setuptools, which is loaded: Python 3.12 has none.
+from distutils.command.build_scripts import build_scripts  # isort: skip
 
 HERE = Path(__file__).parent.resolve()
 IS_PURE = bool(os.environ.get("COSEG_PURE"))

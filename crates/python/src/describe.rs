@@ -13,7 +13,10 @@ use pyo3::types::{PyDict, PyDictMethods};
 
 /// The description as a dictionary of arrays, of a proxy of about `working_faces` faces.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "the arrays of a mesh, and the options")]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "the arrays of a mesh, and the options"
+)]
 pub(crate) fn describe<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
@@ -73,7 +76,13 @@ pub(crate) fn segment<'py>(
     let (patches, dim) = (owned(&patches)?, descriptors.shape()[1]);
     let descriptors = descriptors.as_slice()?.to_vec();
     let found = interruptible(py, None, move |_| {
-        Ok(parts(&Surface::new(&mesh), &patches, &descriptors, dim, n_parts))
+        Ok(parts(
+            &Surface::new(&mesh),
+            &patches,
+            &descriptors,
+            dim,
+            n_parts,
+        ))
     })?;
     Ok(PyArray1::from_vec(py, found))
 }

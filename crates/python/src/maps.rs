@@ -13,7 +13,7 @@ use coseg_geometry::fmap::probes::{Probes, curvature_probes, probes, standardise
 use coseg_geometry::fmap::solve::{Energy, laplacian_mask, resolvent_mask};
 use coseg_geometry::fmap::{self, EstimateOptions, PointMap, Side, transfer};
 use nalgebra::{DMatrix, DVector};
-use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::{Bound, PyResult, Python, pyfunction};
 use pyo3::types::{PyDict, PyDictMethods, PyList, PyListMethods};
 use std::sync::Arc;
@@ -22,7 +22,10 @@ use std::sync::Arc;
 /// `probes_1 (n1, p)` and `probes_2 (n2, p)` functions that do. Weights are relative to the
 /// spectral coordinates.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "two shapes, what is known of them, and options")]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "two shapes, what is known of them, and options"
+)]
 pub(crate) fn point_maps<'py>(
     py: Python<'py>,
     one: &Shape,
@@ -109,7 +112,10 @@ fn fields(py: Python<'_>, map: PointMap) -> PyResult<Bound<'_, PyDict>> {
 /// For each vertex of shape 1 a vertex of shape 2, by the same `c_12 (k, k)`, and whether something
 /// corresponds to it.
 #[pyfunction]
-#[expect(clippy::type_complexity, reason = "one tuple that Python unpacks at once")]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
 pub(crate) fn point_map_back<'py>(
     py: Python<'py>,
     one: &Shape,
@@ -147,7 +153,9 @@ pub(crate) fn pointwise<'py>(
             (true, false) => convert::pointwise(&one.basis(), &two.basis(), &c, k1),
             // The adjoint from the other side: the same distances.
             (true, true) => {
-                let transposed = (0..k1 * k2).map(|i| c[i % k2 * k1 + i / k2]).collect::<Vec<_>>();
+                let transposed = (0..k1 * k2)
+                    .map(|i| c[i % k2 * k1 + i / k2])
+                    .collect::<Vec<_>>();
                 convert::pointwise_adjoint(&two.basis(), &one.basis(), &transposed, k2)
             }
             (false, false) => {
@@ -176,7 +184,13 @@ pub(crate) fn functional<'py>(
     let (one, two) = (Arc::clone(&one.kept), Arc::clone(&two.kept));
     let p2p_21 = owned(&p2p_21)?;
     let found = interruptible(py, None, move |_| {
-        Ok(convert::functional(&one.basis(), &two.basis(), &p2p_21, k1, k2))
+        Ok(convert::functional(
+            &one.basis(),
+            &two.basis(),
+            &p2p_21,
+            k1,
+            k2,
+        ))
     })?;
     matrix(py, double(&found), k1)
 }
@@ -241,7 +255,10 @@ pub(crate) fn zoomout<'py>(
 
 /// For each vertex of shape 2 a face of shape 1 and barycentric coordinates `(n2, 3)` there.
 #[pyfunction]
-#[expect(clippy::type_complexity, reason = "one tuple that Python unpacks at once")]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
 pub(crate) fn precise<'py>(
     py: Python<'py>,
     one: &Shape,
@@ -251,7 +268,13 @@ pub(crate) fn precise<'py>(
     let (one, two) = (Arc::clone(&one.kept), Arc::clone(&two.kept));
     let (c, k1) = single(&c_12)?;
     let found = interruptible(py, None, move |_| {
-        Ok(fmap::precise::precise(&one.basis(), &two.basis(), &one.faces, &c, k1))
+        Ok(fmap::precise::precise(
+            &one.basis(),
+            &two.basis(),
+            &one.faces,
+            &c,
+            k1,
+        ))
     })?;
     let weights = double(found.barycentric.as_flattened());
     Ok((PyArray1::from_vec(py, found.face), matrix(py, weights, 3)?))
@@ -260,7 +283,10 @@ pub(crate) fn precise<'py>(
 /// The functional map `(k2, k1)` that carries probe functions `(n1, p)` to probe functions
 /// `(n2, p)`, both standardised here, by the weights of the four terms.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "two shapes, their functions, sizes and weights")]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "two shapes, their functions, sizes and weights"
+)]
 pub(crate) fn fit<'py>(
     py: Python<'py>,
     one: &Shape,
@@ -296,7 +322,13 @@ pub(crate) fn fit<'py>(
         // Constants go to constants: the first eigenfunctions are, and both are positive.
         let mut first_column = DVector::zeros(k2);
         first_column[0] = 1.0;
-        Ok::<_, Failure>(energy.minimiser(&first_column)?.transpose().as_slice().to_vec())
+        Ok::<_, Failure>(
+            energy
+                .minimiser(&first_column)?
+                .transpose()
+                .as_slice()
+                .to_vec(),
+        )
     })?;
     matrix(py, found, k1)
 }
@@ -382,9 +414,8 @@ pub(crate) fn faces_to_faces<'py>(
     let (faces_1, faces_2) = (rows(&faces_1)?, rows(&faces_2)?);
     let (p2p_21, matched) = (p2p_21.as_slice()?, matched.as_slice()?);
     let (values, dim) = single(&values)?;
-    let found = py.detach(|| {
-        transfer::faces_to_faces(faces_1, faces_2, n_1, p2p_21, matched, &values, dim)
-    });
+    let found = py
+        .detach(|| transfer::faces_to_faces(faces_1, faces_2, n_1, p2p_21, matched, &values, dim));
     matrix(py, double(&found), dim)
 }
 

@@ -6,9 +6,7 @@ use crate::work::interruptible;
 use coseg_geometry::mesh::{
     self, EdgeGraph, Format, ParsedMesh, Triangulator, bridges, geodesic::Distances,
 };
-use numpy::{
-    PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods,
-};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::{Bound, PyResult, Python, pyfunction};
 use pyo3::types::{PyDict, PyDictMethods};
 
@@ -55,7 +53,9 @@ pub(crate) fn triangulate<'py>(
     let (mut triangles, mut polygon_of_triangle) = (Vec::new(), Vec::new());
     let mut triangulator = Triangulator::default();
     for (polygon, window) in offsets.as_slice()?.windows(2).enumerate() {
-        let range = usize::try_from(window[0]).ok().zip(usize::try_from(window[1]).ok());
+        let range = usize::try_from(window[0])
+            .ok()
+            .zip(usize::try_from(window[1]).ok());
         let own = range.and_then(|(from, to)| corners.get(from..to));
         let Some(own) = own.filter(|own| !own.is_empty()) else {
             let message = format!("polygon {polygon} has no corners, but at least 1 is needed");
@@ -93,7 +93,10 @@ pub(crate) fn parsed(
 /// A mesh that can be measured, in the units and the place of the input: vertices, faces, for each
 /// vertex of the input its vertex (−1: none), for each face of the input its face, and counts.
 #[pyfunction]
-#[expect(clippy::type_complexity, reason = "one tuple that Python unpacks at once")]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
 pub(crate) fn clean<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
@@ -188,7 +191,11 @@ pub(crate) fn edge_distances<'py>(
     let mesh = tri_mesh(&vertices, &faces)?;
     let (sources, n) = (owned(&sources)?, mesh.vertices.len());
     let found = interruptible(py, None, move |control| {
-        let joins = if join_components { bridges(&mesh) } else { Vec::new() };
+        let joins = if join_components {
+            bridges(&mesh)
+        } else {
+            Vec::new()
+        };
         let graph = EdgeGraph::new(&mesh, &joins);
         let mut distances = Distances::default();
         let mut found = Vec::with_capacity(sources.len() * n);

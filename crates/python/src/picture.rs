@@ -39,10 +39,9 @@ pub(crate) fn faces_in_sight<'py>(
                 break;
             }
             for (column, pixel) in pixels.iter_mut().enumerate() {
-                let x = 0.5 * (low[0] + high[0])
-                    + (column as f64 + 0.5 - 0.5 * width as f64) * unit;
-                let y = 0.5 * (low[1] + high[1])
-                    - (row as f64 + 0.5 - 0.5 * height as f64) * unit;
+                let x =
+                    0.5 * (low[0] + high[0]) + (column as f64 + 0.5 - 0.5 * width as f64) * unit;
+                let y = 0.5 * (low[1] + high[1]) - (row as f64 + 0.5 - 0.5 * height as f64) * unit;
                 lengths.clear();
                 let down = [[0.0, 0.0, -1.0]];
                 tree.cast(&mut search, [x, y, above], &down, u32::MAX, &mut lengths);

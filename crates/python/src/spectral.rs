@@ -26,7 +26,10 @@ pub(crate) fn operator(name: &str) -> Result<Operator, Failure> {
 /// Stiffness as the arrays of a CSR matrix (row starts, columns, values), mass `(n,)`, and the
 /// number of bridges.
 #[pyfunction]
-#[expect(clippy::type_complexity, reason = "one tuple that Python unpacks at once")]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
 pub(crate) fn laplacian<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
@@ -43,7 +46,11 @@ pub(crate) fn laplacian<'py>(
     let mesh = tri_mesh(&vertices, &faces)?;
     let operator = operator(operator_name).map_err(|failure| failure.raise(py))?;
     let (found, n_bridges) = interruptible(py, None, move |_| {
-        let joins = if join_components { bridges(&mesh) } else { Vec::new() };
+        let joins = if join_components {
+            bridges(&mesh)
+        } else {
+            Vec::new()
+        };
         let found = operators::laplacian(&mesh, &joins, operator)?;
         Ok((found, joins.len()))
     })?;
@@ -63,8 +70,14 @@ pub(crate) fn laplacian<'py>(
 
 /// Eigenvalues `(k,)`, eigenvectors `(n, k)`, residuals `(k,)` and the certificate.
 #[pyfunction]
-#[expect(clippy::type_complexity, reason = "one tuple that Python unpacks at once")]
-#[expect(clippy::too_many_arguments, reason = "the arrays of a matrix, and the options")]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "the arrays of a matrix, and the options"
+)]
 pub(crate) fn spectrum<'py>(
     py: Python<'py>,
     row_starts: PyReadonlyArray1<'py, i64>,
@@ -90,8 +103,9 @@ pub(crate) fn spectrum<'py>(
     let (pairs, rows) = interruptible(py, progress, move |control| {
         let n = mass.len();
         let stiffness = sprs::CsMat::try_new((n, n), row_starts, columns, values);
-        let stiffness = stiffness
-            .map_err(|(.., error)| Failure::argument(format!("the stiffness is no CSR: {error}")))?;
+        let stiffness = stiffness.map_err(|(.., error)| {
+            Failure::argument(format!("the stiffness is no CSR: {error}"))
+        })?;
         with_threads(threads, |threads| {
             let hook = |progress: &_| control.at(progress);
             let options = Options {
@@ -139,7 +153,10 @@ pub(crate) fn point_kernels<'py>(
     n_energies: usize,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let (values, times) = (eigenvalues.as_slice()?, times.as_slice()?);
-    let (rows, [n, k]) = (eigenvectors.as_slice()?, [eigenvectors.shape()[0], eigenvectors.shape()[1]]);
+    let (rows, [n, k]) = (
+        eigenvectors.as_slice()?,
+        [eigenvectors.shape()[0], eigenvectors.shape()[1]],
+    );
     let (out, width) = py.detach(|| {
         let kernels = PointKernels::new(&values[..k.min(values.len())], times, n_energies);
         let mut out = vec![0.0; n * kernels.n_columns()];

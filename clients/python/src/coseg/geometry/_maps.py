@@ -140,8 +140,8 @@ class FunctionalMap:
 
     def picture(self, *, size: tuple[int, int] = (320, 320)) -> Picture:
         """Shape 1 coloured by position, and shape 2 by the map."""
-        box = self.mesh_1.vertices - self.mesh_1.vertices.min(axis=0)
-        colours = 0.15 + 0.8 * box / max(float(box.max()), 1e-300)
+        low, high = self.mesh_1.vertices.min(axis=0), self.mesh_1.vertices.max(axis=0)
+        colours = 0.15 + 0.8 * (self.mesh_1.vertices - low) / np.maximum(high - low, 1e-300)
         return beside(picture(self.mesh_1, colours, size), picture(self.mesh_2, self.transfer(colours), size))
 
     def plot(self, *, size: tuple[int, int] = (320, 320)) -> Picture:
