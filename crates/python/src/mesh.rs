@@ -43,6 +43,10 @@ pub(crate) fn parse<'py>(
 /// Polygons, given by their `corners` one after the other and where each begins (`offsets`, with
 /// the end), become triangles and the polygon of each.
 #[pyfunction]
+#[expect(
+    clippy::type_complexity,
+    reason = "one tuple that Python unpacks at once"
+)]
 pub(crate) fn triangulate<'py>(
     py: Python<'py>,
     vertices: PyReadonlyArray2<'py, f64>,
