@@ -29,12 +29,17 @@ fi
 step "Python: wheel and source archive, in an environment of their own"
 (
     "$WORK/venv/bin/python" - "$WORK"/wheel/*.whl <<'PY'
-import sys, zipfile
+import os, sys, zipfile
 names = zipfile.ZipFile(sys.argv[1]).namelist()
 wanted = ["py.typed", "_client.py", "v1/__init__.py", "v1/message_pb2.py", "v1/message_pb2.pyi"]
+wanted += ["_native.abi3.so", "_native.pyi", "geometry/__init__.py"]
 assert not (missing := [n for n in wanted if f"coseg/{n}" not in names]), missing
+assert any(n.endswith(".data/scripts/coseg") for n in names), names
+assert "-cp310-abi3-" in sys.argv[1], sys.argv[1]
+n_bytes = os.path.getsize(sys.argv[1])
+assert n_bytes < 40_000_000, n_bytes
 assert sum("/licenses/LICENSE-" in n for n in names) == 2, names
-print(sys.argv[1].rsplit("/", 1)[1], len(names), "files")
+print(sys.argv[1].rsplit("/", 1)[1], len(names), "files,", n_bytes, "bytes")
 PY
     rm -rf "$WORK/archive" "$WORK/stranger"
     (cd "$WORK/clean/clients/python" && python -c '
@@ -43,10 +48,32 @@ from setuptools.build_meta import build_sdist
 build_sdist(sys.argv[1])' "$WORK/archive" >/dev/null)
     python3 -m venv "$WORK/stranger"
     cd "$WORK/stranger"
-    for package in "$WORK"/wheel/*.whl "$WORK"/archive/*.tar.gz; do
+    # The archive holds the workspace that it is built from: here only its manifests are read, and
+    # what cargo has built already is taken.
+    tar -x -C "$WORK/archive" -f "$WORK"/archive/*.tar.gz
+    (cd "$WORK"/archive/coseg-*/workspace && cargo metadata --locked --format-version 1 >/dev/null)
+    for package in "$WORK"/archive/*.tar.gz "$WORK"/wheel/*.whl; do
         bin/python -m pip install -q --force-reinstall "$package"
-        bin/python -c 'import coseg; from coseg.v1 import message_pb2; print(coseg.__file__)'
+        # Nothing of Rust is on the path.
+        env -i HOME="$PWD" PATH="$PWD/bin:/usr/bin:/bin" bash -ec '
+            python -c "import coseg; from coseg.v1 import message_pb2; print(coseg.__file__)"
+            python -c "import coseg; print(coseg.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))"
+            coseg --version'
     done
+    env -i HOME="$PWD" PATH="$PWD/bin:/usr/bin:/bin" coseg demo | tail -n 3
+    # The client alone, where there is no module for the platform.
+    rm -rf "$WORK/pure"
+    COSEG_PURE=1 "$WORK/venv/bin/python" -m pip wheel -q --no-deps -w "$WORK/pure" "$WORK/clean/clients/python"
+    bin/python -m pip install -q --force-reinstall --no-deps "$WORK"/pure/coseg-*-py3-none-any.whl
+    bin/python -c '
+import coseg
+coseg.Library("ipc:///nowhere").close()
+try:
+    coseg.Mesh
+except ImportError as error:
+    print(error)
+else:
+    raise SystemExit("the pure client has a native module")'
 )
 
 step "Python: style, types, tests"

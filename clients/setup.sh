@@ -24,21 +24,34 @@ need() {
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >/dev/null
 }
 
-# The clients and the protocol as a stranger gets them, in $WORK/clean: nothing that was made in the
-# tree is among them.
+# The clients, the protocol and the Rust workspace as a stranger gets them, in $WORK/clean: nothing
+# that was made in the tree is among them.
 clean_copy() {
+    local parts=(clients proto Cargo.toml Cargo.lock README.md LICENSE-APACHE LICENSE-MIT)
+    parts+=(benches config crates examples src vendor)
     rm -rf "$WORK/clean"
     mkdir -p "$WORK/clean"
     if git -C "$ROOT" rev-parse --git-dir >/dev/null 2>&1; then
         (
             cd "$ROOT"
             # What is not ignored and still there, committed or not.
-            git ls-files -z --cached --others --exclude-standard clients proto |
+            git ls-files -z --cached --others --exclude-standard "${parts[@]}" |
                 tar -c --null --files-from - --ignore-failed-read 2>/dev/null
         ) | tar -x -C "$WORK/clean"
     else
-        cp -r "$ROOT/clients" "$ROOT/proto" "$WORK/clean"
+        (cd "$ROOT" && cp -r "${parts[@]}" "$WORK/clean")
     fi
+}
+
+# The binary and the native module of Python in the folder $COSEG_BUILT, which setup.py takes them
+# from: those beside $COSEG_BIN, else what cargo makes (nothing, after a build of the workspace).
+native() {
+    COSEG_BUILT="$(dirname "$COSEG_BIN")"
+    if [ ! -f "$COSEG_BUILT/lib_native.so" ] || [ "$COSEG_BUILT" = "$ROOT/target/release" ]; then
+        (cd "$ROOT" && cargo build --release --locked --quiet -p coseg -p coseg-python)
+        COSEG_BUILT="$ROOT/target/release"
+    fi
+    export COSEG_BUILT
 }
 
 # The Python package with what its tests need, in $WORK/venv: the wheel that is built from a clean
@@ -54,6 +67,7 @@ python_tools() {
         "$WORK/venv/bin/python" -m pip install -q -r "$ROOT/clients/python/requirements-dev.txt"
     fi
     clean_copy
+    native
     rm -rf "$WORK/wheel"
     "$WORK/venv/bin/python" -m pip wheel -q --no-deps -w "$WORK/wheel" "$WORK/clean/clients/python"
     "$WORK/venv/bin/python" -m pip install -q --no-deps --force-reinstall "$WORK"/wheel/*.whl

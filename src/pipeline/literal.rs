@@ -6,7 +6,7 @@
 //! correspond through the map from a reference get the reference's label. The paper leaves open which shape that is:
 //! here the one whose maps to all others leave the least residual.
 
-use super::describe::spectrum_of;
+use super::spectrum_of;
 use super::{DescribeError, DescriptionView, N_HKS_TIMES, Params};
 use crate::descriptors::{gps, hks, hks_times};
 use crate::linalg::assignment::assignment;

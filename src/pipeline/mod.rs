@@ -1,6 +1,5 @@
 //! START HERE. Bytes become a [`Description`]; a description and a library snapshot become a [`Labelling`].
 
-mod describe;
 mod exemplars;
 mod literal;
 mod place;
@@ -8,7 +7,7 @@ mod recluster;
 mod split;
 
 pub use crate::description::{Description, DescriptionView, Params};
-pub use describe::{
+pub use coseg_geometry::describe::{
     ALGORITHM_VERSION, DescribeError, MeshSpectrum, N_HKS_TIMES, READING_VERSION, describe,
     spectrum_of,
 };

@@ -22,8 +22,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from pyFM.functional import FunctionalMapping  # type: ignore[import-not-found]
-from pyFM.mesh import TriMesh  # type: ignore[import-not-found]
+from pyFM.functional import FunctionalMapping
+from pyFM.mesh import TriMesh
 
 import coseg
 

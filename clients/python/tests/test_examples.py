@@ -11,13 +11,22 @@ from pathlib import Path
 import nbclient
 import nbformat
 import pytest
-from conftest import BINARY, ROOT, Daemon
+from conftest import BINARY, ROOT, Daemon, environment
 
 import coseg
 
-NOTEBOOK = Path(__file__).parent.parent / "examples" / "tour.ipynb"
+EXAMPLES = Path(__file__).parent.parent / "examples"
+NOTEBOOK = EXAMPLES / "tour.ipynb"
 #: Documents whose Python is executed, top to bottom, as one program each.
 DOCUMENTS = ["README.md", "clients/python/README.md", "docs/clients.md"]
+#: The same without a daemon, on two animals; the peers that they name are installed for that.
+PAGES = {
+    "docs/python.md": "assert at_lion.shape == (lion.n_vertices, 100) and len(labels) == lion.n_faces",
+    "docs/from-pyfm.md": "assert theirs.shape == ours.shape == (lion.n_vertices, 3)",
+    "docs/from-lapy.md": "import numpy as np; assert np.allclose(theirs, ours, rtol=1e-6)",
+    "docs/from-robust-laplacian.md": "assert np.allclose(theirs, ours, rtol=1e-4, atol=1e-8); "
+    "assert np.allclose(same_matrices, theirs, rtol=1e-6, atol=1e-8)",
+}
 
 
 def on_path(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,6 +41,36 @@ def test_the_notebook_runs(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> N
     text = str(notebook)
     assert "int32" in text and "coseg.v1" in text
     assert all(not cell.get("outputs") for cell in nbformat.read(NOTEBOOK, as_version=4).cells)
+
+
+@pytest.fixture(scope="session")
+def animals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with cat.off and lion.off: two quadrupeds, at least."""
+    folder = tmp_path_factory.mktemp("animals")
+    command = [BINARY, "synth", "animal", "--count", "2", "--faces", "3000", "--out", str(folder)]
+    subprocess.run(command, check=True, capture_output=True, env=environment())
+    for name, mesh in zip(("cat", "lion"), sorted(folder.glob("*.off")), strict=True):
+        mesh.rename(folder / f"{name}.off")
+    return folder
+
+
+def test_the_notebook_without_a_daemon_runs(animals: Path) -> None:
+    notebook = nbformat.read(EXAMPLES / "geometry.ipynb", as_version=4)
+    assert all(not cell.get("outputs") for cell in notebook.cells)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": animals}}).execute()
+    shown = [
+        o for cell in notebook.cells for o in cell.get("outputs", []) if "text/html" in o.get("data", {})
+    ]
+    assert len(shown) == 3 and all("data:image/png" in o.data["text/html"] for o in shown)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_run(page: str, animals: Path, tmp_path: Path) -> None:
+    for mesh in animals.glob("*.off"):
+        (tmp_path / mesh.name).write_bytes(mesh.read_bytes())
+    (tmp_path / "page.py").write_text(f"{snippets(page)}\n{PAGES[page]}\n")
+    done = subprocess.run([sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def snippets(document: str) -> str:

@@ -15,6 +15,7 @@ pub mod spectrum;
 pub mod description;
 pub mod descriptors;
 pub mod segmentation;
+pub mod describe;
 pub mod fmap;
 pub mod spectral_mesh;
 

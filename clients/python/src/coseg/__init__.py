@@ -1,6 +1,14 @@
-"""Client of the coseg daemon: consistent labels, spectra and functional maps of 3D shapes.
+"""Consistent labels, spectra and functional maps of 3D shapes.
+
+With meshes of your own, in this process (:mod:`coseg.geometry`):
 
 >>> import coseg
+>>> cat, lion = coseg.read_mesh("cat.off"), coseg.read_mesh("lion.off")    # doctest: +SKIP
+>>> cat.spectrum(k=300).eigenvalues                                        # doctest: +SKIP
+>>> coseg.functional_map(cat, lion).p2p_21                                 # doctest: +SKIP
+
+With a daemon that keeps a library of shapes labelled:
+
 >>> lib = coseg.Library()                                   # doctest: +SKIP
 >>> chairs = lib.collection("chairs", parts=4, up="+y")     # doctest: +SKIP
 >>> chairs.add("101", "meshes/101.off")                     # doctest: +SKIP
@@ -9,28 +17,38 @@
 :class:`AsyncLibrary` and :class:`AsyncCollection` are the same for asyncio.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from coseg._async_client import AsyncCollection, AsyncLibrary
 from coseg._batch import Item
 from coseg._client import Collection, Library
 from coseg._options import Curve, default_endpoint
-from coseg._wire import Mesh
+from coseg._wire import MeshLike
 from coseg.errors import (
     AlreadyExists,
     BadMesh,
     BadReply,
     Cancelled,
+    CleanError,
     CosegError,
     DataLoss,
     DeadlineExceeded,
     EventLogRewound,
     FailedPrecondition,
+    GeometryError,
     Internal,
     InvalidArgument,
+    LaplacianError,
     NoAnswer,
     NotFound,
+    ParseError,
     PermissionDenied,
     Refused,
     ResourceExhausted,
+    SolveError,
+    SpectrumError,
 )
 from coseg.types import (
     Added,
@@ -67,6 +85,9 @@ from coseg.types import (
     UpEstimate,
 )
 
+if TYPE_CHECKING:
+    from coseg.geometry import Mesh, functional_map, read_mesh
+
 __version__ = "0.1.0"
 __all__ = [
     "Added",
@@ -78,6 +99,7 @@ __all__ = [
     "Cancelled",
     "Carrying",
     "ChangedLabel",
+    "CleanError",
     "Collection",
     "CollectionInfo",
     "Corrected",
@@ -91,6 +113,7 @@ __all__ = [
     "EventLogRewound",
     "FailedPrecondition",
     "FunctionalMap",
+    "GeometryError",
     "Hello",
     "Idle",
     "Internal",
@@ -100,14 +123,17 @@ __all__ = [
     "JobItem",
     "Label",
     "Labelling",
+    "LaplacianError",
     "Library",
     "Limits",
     "MapAgreement",
     "MapQuality",
     "Mesh",
+    "MeshLike",
     "Neighbor",
     "NoAnswer",
     "NotFound",
+    "ParseError",
     "Part",
     "PartMatch",
     "PartMatches",
@@ -117,12 +143,25 @@ __all__ = [
     "RetriedJob",
     "Shape",
     "Snapshot",
+    "SolveError",
     "Source",
     "Spectrum",
+    "SpectrumError",
     "Suggestion",
     "Transferred",
     "Undone",
     "UpEstimate",
     "Updated",
     "default_endpoint",
+    "functional_map",
+    "read_mesh",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded when it is used: a client of a daemon needs no native module.
+    if name in ("Mesh", "functional_map", "read_mesh"):
+        from coseg import geometry
+
+        return getattr(geometry, name)
+    raise AttributeError(f"module 'coseg' has no attribute {name!r}")

@@ -18,7 +18,7 @@ from coseg._batch import Batch, Item, batches
 from coseg._link import Frame
 from coseg._options import Curve, default_endpoint, new_client_id, reachable
 from coseg._size import beyond
-from coseg._wire import FrameWriter, Mesh, Raw
+from coseg._wire import FrameWriter, MeshLike, Raw
 from coseg.errors import BadReply, CosegError, EventLogRewound, NoAnswer, Refused
 from coseg.v1 import collection_pb2, event_pb2, message_pb2
 
@@ -268,7 +268,7 @@ class AsyncCollection:
 
     # -- adding ---------------------------------------------------------------------------------
 
-    async def add(self, name: str, mesh: Mesh, *, replace: bool = False) -> t.Added:
+    async def add(self, name: str, mesh: MeshLike, *, replace: bool = False) -> t.Added:
         """Adds a shape and waits until it is labelled. A refusal is raised.
 
         A mesh is the path of a file, :class:`coseg.Encoded` bytes, ``(vertices, faces)``, or an object

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from coseg import types as t
 from coseg._size import beyond
-from coseg._wire import FrameWriter, Mesh, shape_input
+from coseg._wire import FrameWriter, MeshLike, shape_input
 from coseg.errors import BadMesh
 from coseg.v1 import collection_pb2, job_pb2
 
@@ -18,7 +18,7 @@ from coseg.v1 import collection_pb2, job_pb2
 BATCH_SHAPES = 16
 BATCH_BYTES = 16 << 20
 #: What :meth:`add_many` takes: paths, named after their stems, or pairs of a name and a mesh.
-Item = str | os.PathLike[str] | tuple[str, Mesh]
+Item = str | os.PathLike[str] | tuple[str, MeshLike]
 
 
 @dataclass

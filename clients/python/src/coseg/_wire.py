@@ -56,7 +56,7 @@ class HasFaces(Protocol):
 
 
 #: A mesh: the path of a file, the bytes of one, ``(vertices, faces)``, or an object that has both.
-Mesh = str | os.PathLike[str] | t.Encoded | tuple[ArrayLike, ArrayLike] | HasFaces
+MeshLike = str | os.PathLike[str] | t.Encoded | tuple[ArrayLike, ArrayLike] | HasFaces
 
 
 class FrameWriter:
@@ -83,7 +83,7 @@ class FrameWriter:
         return len(self.frames) - 1
 
 
-def shape_input(name: str, mesh: Mesh, replace: bool, writer: FrameWriter) -> job_pb2.ShapeInput:
+def shape_input(name: str, mesh: MeshLike, replace: bool, writer: FrameWriter) -> job_pb2.ShapeInput:
     """A shape to add; its bytes go to ``writer``. Raises :class:`BadMesh` or :class:`OSError`."""
     shape = job_pb2.ShapeInput(name=name, replace=replace)
     if isinstance(mesh, str | os.PathLike):

@@ -32,6 +32,51 @@ class BadMesh(CosegError, ValueError):
     """What was given as a mesh is none; nothing was sent."""
 
 
+class GeometryError(CosegError, ValueError):
+    """A mesh, or what was asked of it, has no answer; raised in this process, not by a daemon."""
+
+    #: Name of the case, such as ``"VertexOutOfRange"`` or ``"NotConverged"``.
+    kind: str
+    #: For people: the value and the limit.
+    message: str
+    #: Face of the mesh, from 0.
+    face: int | None = None
+    #: Vertex of the mesh, from 0.
+    vertex: int | None = None
+    #: Line of the text file, from 1.
+    line: int | None = None
+
+    def __init__(self, kind: str, message: str, location: dict[str, int] | None = None) -> None:
+        super().__init__(message)
+        self.kind, self.message = kind, message
+        self._location = location or {}
+        for name, index in self._location.items():
+            setattr(self, name, index)
+
+    def __reduce__(self) -> tuple[type[GeometryError], tuple[str, str, dict[str, int]]]:
+        return type(self), (self.kind, self.message, self._location)
+
+
+class ParseError(GeometryError):
+    """A file is no mesh."""
+
+
+class CleanError(GeometryError):
+    """No triangle of a mesh can be measured."""
+
+
+class LaplacianError(GeometryError):
+    """A mesh has no Laplacian; ``mesh.clean()`` mends what can be mended."""
+
+
+class SpectrumError(GeometryError):
+    """There is no spectrum, or it could not be proved complete."""
+
+
+class SolveError(GeometryError):
+    """Functions and weights do not determine a map."""
+
+
 class EventLogRewound(CosegError):
     """A collection's log ends before events that were seen: another library is served there now."""
 

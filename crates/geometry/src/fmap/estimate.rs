@@ -395,21 +395,30 @@ fn best(mut found: Vec<Candidate>, keep: usize) -> Vec<Candidate> {
 /// Number of cells of samples of shape 1 that are searched for each vertex of shape 2.
 const N_PROBED: usize = 4;
 
-/// The pointwise map `p2p_21 (n2,)` of a functional map: for each row of `Φ₂` the nearest of `Φ₁
-/// C₁₂ᵀ`, searched in the nearest few cells of samples of shape 1. O(n2 (samples + n1 / samples)
-/// k).
-pub fn dense(one: (&Basis<'_>, &Frame), two: &Basis<'_>, pair: &Pair) -> Vec<u32> {
-    let k = pair.k;
-    let targets = product_transposed(&one.0.leading(k), &pair.c_12, one.0.n_vertices(), k, k);
-    let queries = two.leading(k);
-    let n = one.1.levels.len();
-    let Some(level) = one.1.levels.get(n.saturating_sub(2)) else {
-        return nearest_rows(&queries, &targets, k);
+/// The pointwise map `p2p_21 (n2,)` of a functional map `c_12 (k, k)`: for each row of `Φ₂` the
+/// nearest of `Φ₁ C₁₂ᵀ`, searched in the nearest few cells of samples of shape 1. O(n2 (samples +
+/// n1 / samples) k).
+pub fn dense(one: (&Basis<'_>, &Frame), two: &Basis<'_>, c_12: &[f32], k: usize) -> Vec<u32> {
+    let targets = product_transposed(&one.0.leading(k), c_12, one.0.n_vertices(), k, k);
+    nearest_of(one.1, &two.leading(k), &targets, k)
+}
+
+/// The pointwise map `p2p_12 (n1,)` of the same `c_12`: for each row of `Φ₁ C₁₂ᵀ` the nearest of
+/// `Φ₂`, by cells of samples of shape 2. The same distances as in [`dense`], from the other side.
+pub fn dense_back(one: &Basis<'_>, two: (&Basis<'_>, &Frame), c_12: &[f32], k: usize) -> Vec<u32> {
+    let queries = product_transposed(&one.leading(k), c_12, one.n_vertices(), k, k);
+    nearest_of(two.1, &queries, &two.0.leading(k), k)
+}
+
+fn nearest_of(frame: &Frame, queries: &[f32], targets: &[f32], k: usize) -> Vec<u32> {
+    let n = frame.levels.len();
+    let Some(level) = frame.levels.get(n.saturating_sub(2)) else {
+        return nearest_rows(queries, targets, k);
     };
     let cells = &level.samples;
     nearest_in_cells(
-        &queries,
-        &targets,
+        queries,
+        targets,
         k,
         &cells.vertices,
         &cells.nearest,

@@ -34,7 +34,9 @@ pub use estimate::{EstimateOptions, Side};
 pub use parts::{
     MapOptions, MapShape, descriptor_zoomout, descriptor_zoomout_from, nearest_descriptors,
 };
-pub use points::{PointMap, PointShape, point_maps};
+pub use points::{
+    PointMap, PointMapBack, PointShape, point_map_back, point_maps, point_maps_by_probes,
+};
 pub use quality::{Assessment, Quality};
 pub use zoomout::{zoomout, zoomout_sampled};
 

@@ -2,11 +2,14 @@
 //! accuracy of both.
 
 use super::basis::Basis;
-use super::bijective::Hints;
-use super::estimate::{Candidate, EstimateOptions, Frame, dense, estimate};
+use super::bijective::{Hints, Pair};
+use super::estimate::{Candidate, EstimateOptions, Frame, dense, dense_back, estimate};
 use super::landmarks::landmark_probes;
+use super::probes::Probes;
 use super::quality::{Assessment, Quality, returned};
+use super::samples::Samples;
 use crate::mesh::{EdgeGraph, TriMesh, bridges};
+use std::sync::Arc;
 
 /// A point of shape 2 counts as matched if mapping it to shape 1 and back moves it by at most this,
 /// in units of the square root of the area.
@@ -21,7 +24,7 @@ pub struct PointShape<'a> {
     pub faces: &'a [[u32; 3]],
     /// Spectrum.
     pub basis: Basis<'a>,
-    frame: Frame,
+    frame: Arc<Frame>,
 }
 
 impl<'a> PointShape<'a> {
@@ -38,12 +41,28 @@ impl<'a> PointShape<'a> {
             faces: faces.to_vec(),
         };
         let graph = EdgeGraph::new(&mesh, &bridges(&mesh));
+        let frame = Frame::new(&graph, vertices, faces, &basis, options);
+        Self::with_frame(vertices, faces, basis, Arc::new(frame))
+    }
+
+    /// The same shape again, with the [`PointShape::frame`] that was computed for it.
+    pub fn with_frame(
+        vertices: &'a [[f32; 3]],
+        faces: &'a [[u32; 3]],
+        basis: Basis<'a>,
+        frame: Arc<Frame>,
+    ) -> Self {
         Self {
             vertices,
             faces,
-            frame: Frame::new(&graph, vertices, faces, &basis, options),
             basis,
+            frame,
         }
+    }
+
+    /// Samples, probe functions and sense of orientation.
+    pub fn frame(&self) -> &Arc<Frame> {
+        &self.frame
     }
 }
 
@@ -93,25 +112,106 @@ pub fn point_maps(
         )
     });
     let marked = marked.as_ref().map(|(a, b)| (a, b));
-    estimate(&one.frame, &two.frame, marked, options)
+    point_maps_by_probes(one, two, marked, options)
+}
+
+/// As [`point_maps`], with further probe functions at the vertices of both shapes, of which column
+/// by column those of shape 1 correspond to those of shape 2: landmarks are such functions, and
+/// whatever else is known to be the same on both ([`standardise`](super::probes::standardise)d).
+///
+/// # Panics
+/// If the probe functions have not a row for each vertex, or not as many columns on both sides.
+pub fn point_maps_by_probes(
+    one: &PointShape<'_>,
+    two: &PointShape<'_>,
+    probes: Option<(&Probes, &Probes)>,
+    options: &EstimateOptions,
+) -> Vec<PointMap> {
+    estimate(&one.frame, &two.frame, probes, options)
         .into_iter()
         .map(|found| finished(one, two, found))
         .collect()
 }
 
+/// A map between points read from shape 1 to shape 2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointMapBack {
+    /// For each vertex of shape 1 a vertex of shape 2.
+    pub p2p_12: Vec<u32>,
+    /// For each vertex of shape 1 whether something corresponds to it.
+    pub matched: Vec<bool>,
+}
+
+/// The other direction of `c_12 (k, k)`, the functional map of a [`PointMap`].
+///
+/// ```
+/// use coseg_geometry::fmap::{EstimateOptions, point_map_back, point_maps};
+/// use coseg_geometry::{SpectralMesh, mesh::icosphere, operators::Operator, spectrum::Options};
+///
+/// let mut egg = icosphere(2);
+/// egg.vertices.iter_mut().for_each(|[x, y, z]| {
+///     *x *= 1.0 + 0.3 * *z;
+///     *y *= 1.5;
+///     *z *= 2.2;
+/// });
+/// let egg = SpectralMesh::new(egg, Operator::Tufted, 60, &Options::default())?;
+/// let options = EstimateOptions::default();
+/// let shape = egg.point_shape(&options);
+/// let map = &point_maps(&shape, &shape, &[], &options)[0];
+/// let back = point_map_back(&shape, &shape, &map.c_12, map.k);
+/// // The map of a shape to itself is the identity, there and back.
+/// let same = |p2p: &[u32]| p2p.iter().enumerate().filter(|(v, t)| *v as u32 == **t).count();
+/// assert!(same(&map.p2p_21) > 140 && same(&back.p2p_12) > 140);
+/// assert_eq!(back.matched.len(), 162);
+/// # Ok::<_, coseg_geometry::SpectralMeshError>(())
+/// ```
+///
+/// # Panics
+/// If there are fewer than `k` eigenvectors.
+pub fn point_map_back(
+    one: &PointShape<'_>,
+    two: &PointShape<'_>,
+    c_12: &[f32],
+    k: usize,
+) -> PointMapBack {
+    let pair = Pair {
+        k,
+        c_12: c_12.to_vec(),
+        // The adjoint: maps that are found are nearly orthogonal.
+        c_21: (0..k * k).map(|i| c_12[i % k * k + i / k]).collect(),
+    };
+    let (from, to) = (one.frame.last(), two.frame.last());
+    let (there, back) = pair.pointwise(&from.basis, &to.basis, &Hints::default());
+    let returns = returned((one.vertices, &from.samples), (&back, &there));
+    PointMapBack {
+        p2p_12: dense_back(&one.basis, (&two.basis, &two.frame), c_12, k),
+        matched: matched_vertices(&from.samples, &returns),
+    }
+}
+
+/// For each vertex whether its nearest sample returns to where it was.
+fn matched_vertices(samples: &Samples, returns: &[f32]) -> Vec<bool> {
+    let nearest = samples.nearest.iter();
+    nearest
+        .map(|s| returns[*s as usize] <= FARTHEST_RETURN)
+        .collect()
+}
+
 fn finished(one: &PointShape<'_>, two: &PointShape<'_>, found: Candidate) -> PointMap {
     let expected_error = expected_error(&found);
-    let p2p_21 = dense((&one.basis, &one.frame), &two.basis, &found.pair);
+    let p2p_21 = dense(
+        (&one.basis, &one.frame),
+        &two.basis,
+        &found.pair.c_12,
+        found.pair.k,
+    );
     let k = found.pair.k;
     let (from, to) = (one.frame.last(), two.frame.last());
     let between = found
         .pair
         .pointwise(&from.basis, &to.basis, &Hints::default());
     let returns = returned((two.vertices, &to.samples), (&between.0, &between.1));
-    let nearest = to.samples.nearest.iter();
-    let matched: Vec<bool> = nearest
-        .map(|s| returns[*s as usize] <= FARTHEST_RETURN)
-        .collect();
+    let matched = matched_vertices(&to.samples, &returns);
     let of_matched = two.basis.mass.iter().zip(&matched).filter(|x| *x.1);
     let total: f32 = two.basis.mass.iter().sum();
     PointMap {

@@ -1,8 +1,8 @@
 //! The bytes of one mesh become its description: a pure function of bytes and parameters.
 
-use super::{Description, Params};
+use crate::description::{Description, Params};
 use crate::descriptors::{self, PointKernels};
-use crate::mesh::{self, CleanError, DualGraph, Format, ParseError, TriMesh};
+use crate::mesh::{self, CleanError, DualGraph, Format, ParseError, ParsedMesh, TriMesh};
 use crate::operators::{Laplacian, LaplacianError, laplacian};
 use crate::segmentation::patches;
 use crate::spectrum::{self, Eigenpairs, Progress, SpectrumError};
@@ -49,8 +49,8 @@ pub struct MeshSpectrum {
     pub operator: Laplacian,
 }
 
-/// Describes a mesh. `stage` is told the name of each stage as it begins; when it returns false the work stops
-/// with [`DescribeError::Cancelled`].
+/// Describes a mesh file. `stage` is told the name of each stage as it begins; when it returns false
+/// the work stops with [`DescribeError::Cancelled`].
 ///
 /// # Errors
 /// Bytes that are no mesh, a mesh without area, a spectrum that cannot be proved complete.
@@ -60,17 +60,40 @@ pub fn describe(
     params: &Params,
     stage: &dyn Fn(&str) -> bool,
 ) -> Result<Description, DescribeError> {
-    let enter = |name: &'static str| {
-        if stage(name) {
-            Ok(())
-        } else {
-            Err(DescribeError::Cancelled(name))
-        }
-    };
-    enter("parse")?;
-    let parsed = mesh::parse(bytes, format)?;
+    entered(stage, "parse")?;
+    describe_parsed(&mesh::parse(bytes, format)?, params, stage)
+}
+
+/// As [`describe`], of a mesh that has been read.
+///
+/// ```
+/// use coseg_geometry::describe::describe_parsed;
+/// use coseg_geometry::description::Params;
+/// use coseg_geometry::mesh::{ParsedMesh, icosphere};
+///
+/// let sphere = icosphere(3);
+/// let parsed = ParsedMesh {
+///     n_polygons: sphere.faces.len(),
+///     polygon_of_triangle: (0..sphere.faces.len() as u32).collect(),
+///     vertices: sphere.vertices,
+///     triangles: sphere.faces,
+///     ..ParsedMesh::default()
+/// };
+/// let found = describe_parsed(&parsed, &Params::default(), &|_| true)?;
+/// assert_eq!(found.face_map.len(), 1280);
+/// # Ok::<_, coseg_geometry::describe::DescribeError>(())
+/// ```
+///
+/// # Errors
+/// As [`describe`], except for the bytes.
+pub fn describe_parsed(
+    parsed: &ParsedMesh,
+    params: &Params,
+    stage: &dyn Fn(&str) -> bool,
+) -> Result<Description, DescribeError> {
+    let enter = |name| entered(stage, name);
     enter("clean")?;
-    let cleaned = mesh::outer_shells(mesh::clean(&parsed)?);
+    let cleaned = mesh::outer_shells(mesh::clean(parsed)?);
     enter("proxy")?;
     let proxy = mesh::proxy(&cleaned.mesh, params.working_faces);
     // What is stored is f32: everything below is computed from exactly that.
@@ -124,6 +147,14 @@ pub fn describe(
     })
 }
 
+fn entered(stage: &dyn Fn(&str) -> bool, name: &'static str) -> Result<(), DescribeError> {
+    if stage(name) {
+        Ok(())
+    } else {
+        Err(DescribeError::Cancelled(name))
+    }
+}
+
 /// The spectrum of a mesh of area 1, with the stages `laplacian` and `spectrum`, and within the latter
 /// those of the solver: `spectrum.factor`, `spectrum.iterate` and so on, over and over.
 ///
@@ -135,13 +166,9 @@ pub fn spectrum_of(
     params: &Params,
     stage: &dyn Fn(&str) -> bool,
 ) -> Result<MeshSpectrum, DescribeError> {
-    if !stage("laplacian") {
-        return Err(DescribeError::Cancelled("laplacian"));
-    }
+    entered(stage, "laplacian")?;
     let operator = laplacian(mesh, bridges, params.operator)?;
-    if !stage("spectrum") {
-        return Err(DescribeError::Cancelled("spectrum"));
-    }
+    entered(stage, "spectrum")?;
     let part = |progress: &Progress| stage(&format!("spectrum.{}", progress.stage));
     let options = spectrum::Options {
         progress: Some(&part),
