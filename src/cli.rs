@@ -4,11 +4,13 @@ mod care;
 mod carrying;
 mod corrections;
 mod looking;
+mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use carrying::{Map, Transfer};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
+pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
 
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
@@ -132,6 +134,12 @@ pub(crate) enum Command {
     Events(Events),
     /// Say which shape is worth labelling by hand next, and why
     Suggest(Suggest),
+    /// Ask for the label of one part after the other, those first whose answers are worth most
+    Ask(Ask),
+    /// Answer a question of `coseg ask`
+    Answer(AnswerQuestion),
+    /// Find all labels of a shape right, which makes it one that others are labelled from
+    Approve(Approve),
     /// Label a shape by hand, and carry that to all others
     Correct(Correct),
     /// Give a label a name
@@ -140,7 +148,8 @@ pub(crate) enum Command {
     Merge(Merge),
     /// Make two labels of one
     Split(Split),
-    /// Take back the newest correction, name, merge, split or change of the up axis; repeat to go further back
+    /// Take back the newest correction, answer, verdict, name, merge, split or change of the up axis; repeat to go
+    /// further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]
@@ -391,6 +400,9 @@ pub(crate) struct Ls {
     /// Only shapes that carry this label, an id or a name
     #[arg(long, value_name = "LABEL")]
     pub(crate) label: Option<String>,
+    /// Only shapes with this verdict by a person
+    #[arg(long, value_name = "STATE")]
+    pub(crate) review: Option<Verdict>,
 }
 
 /// `coseg show`
@@ -625,7 +637,9 @@ mod tests {
 
     #[test]
     fn one_collection_is_named_by_its_place_or_by_a_flag() {
-        for command in ["ls", "wait", "events", "watch", "suggest", "undo", "jobs"] {
+        for command in [
+            "ls", "wait", "events", "watch", "suggest", "ask", "undo", "jobs",
+        ] {
             for line in [
                 &["coseg", command, "chairs"][..],
                 &["coseg", command, "--collection", "chairs"],

@@ -1,5 +1,6 @@
 //! What a person types to correct labels.
 
+use super::questions::Person;
 use super::{InCollection, OneCollection};
 use clap::Args;
 use std::path::PathBuf;
@@ -21,6 +22,8 @@ pub(crate) struct Correct {
     /// The label of that part: an id, or the name of a label that is there
     #[arg(long, value_name = "LABEL", requires = "part")]
     pub(crate) label: Option<String>,
+    #[command(flatten)]
+    pub(crate) person: Person,
     /// Return when the correction is durable, not when it is carried to the other shapes
     #[arg(long)]
     pub(crate) no_wait: bool,

@@ -73,7 +73,10 @@ impl ShapeParts {
 
     /// Number of parts.
     pub fn n_parts(&self) -> usize {
-        self.part_of_patch.iter().max().map_or(0, |p| *p as usize + 1)
+        self.part_of_patch
+            .iter()
+            .max()
+            .map_or(0, |p| *p as usize + 1)
     }
 }
 
@@ -138,8 +141,7 @@ pub fn next_question(shapes: &[AskedShape<'_>], known: &Background<'_>) -> Optio
         each.map(|((near, covered), need)| need * (near - covered).max(0.0))
             .sum()
     };
-    let worth =
-        |i: usize| parts.purity[i].powi(2) * (parts.doubt[i] + WORTH_OF_CERTAIN) * gain(i);
+    let worth = |i: usize| parts.purity[i].powi(2) * (parts.doubt[i] + WORTH_OF_CERTAIN) * gain(i);
     let (_, best) = (0..n)
         .filter(|i| parts.open[*i])
         .map(|i| (worth(i), i))
@@ -178,7 +180,11 @@ struct PartModel {
 impl PartModel {
     fn new(shapes: &[AskedShape<'_>], known: &Background<'_>) -> Self {
         let raw = Features {
-            data: shapes.iter().flat_map(|s| &s.parts.patch_means).copied().collect(),
+            data: shapes
+                .iter()
+                .flat_map(|s| &s.parts.patch_means)
+                .copied()
+                .collect(),
             dim: known.normalisation.mean.len(),
         };
         let features = known.normalisation.standardise(&raw);
@@ -316,7 +322,9 @@ impl Patches {
                 *slot = meant.sqrt() * (0.5 * log_person[i * k + class]).exp();
             }
             let sum: f64 = row[..k].iter().sum();
-            row[..k].iter_mut().for_each(|p| *p *= named / sum.max(1e-300));
+            row[..k]
+                .iter_mut()
+                .for_each(|p| *p *= named / sum.max(1e-300));
         }
         Self {
             width,
@@ -355,7 +363,13 @@ fn labelled_patches(shapes: &[AskedShape<'_>], k: usize) -> Vec<f64> {
     let mut out = Vec::new();
     for shape in shapes {
         let mut area = vec![0.0; shape.parts.n_parts()];
-        let of_patch = || shape.parts.part_of_patch.iter().zip(&shape.parts.patch_area);
+        let of_patch = || {
+            shape
+                .parts
+                .part_of_patch
+                .iter()
+                .zip(&shape.parts.patch_area)
+        };
         of_patch().for_each(|(part, a)| area[*part as usize] += a);
         for (part, a) in of_patch() {
             let part = *part as usize;
@@ -400,7 +414,9 @@ fn person_statistics(
         let slots = person.sums[class * dim..(class + 1) * dim].iter_mut();
         slots.zip(sums).for_each(|(s, x)| *s += x);
     };
-    let patches = labelled.chunks_exact(k).zip(features.data.chunks_exact(dim));
+    let patches = labelled
+        .chunks_exact(k)
+        .zip(features.data.chunks_exact(dim));
     for (labelled, x) in patches {
         for (class, area) in labelled.iter().enumerate().filter(|c| *c.1 > 0.0) {
             add(class, *area, &mut x.iter().map(|x| area * f64::from(*x)));
@@ -417,3 +433,6 @@ fn person_statistics(
     }
     person.with_scatter(&discovered.scatter_within(), 1.0)
 }
+
+#[cfg(test)]
+mod tests;

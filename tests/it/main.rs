@@ -2,6 +2,7 @@
 // Clippy sees tests, not what they share.
 #![allow(clippy::unwrap_used)]
 
+mod asking;
 mod cli;
 mod correcting;
 mod daemon;

@@ -185,7 +185,7 @@ fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, Benc
 }
 
 /// The axis as `coseg add --up` takes it.
-fn up(text: &str) -> Result<wire::Up, String> {
+pub(crate) fn up(text: &str) -> Result<wire::Up, String> {
     Ok(match text.to_ascii_lowercase().as_str() {
         "+x" | "x" => wire::Up::PlusX,
         "-x" => wire::Up::MinusX,
@@ -203,7 +203,7 @@ fn up(text: &str) -> Result<wire::Up, String> {
     })
 }
 
-fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
+pub(crate) fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count().max(1) as f64
 }
 

@@ -84,6 +84,7 @@ fn shapes_are_labelled_in_the_order_of_their_faces() {
         ListShapes(wire::ListShapesRequest {
             page_token,
             ..request
+            review: 0,
         })
     )
     .unwrap();
