@@ -4,11 +4,13 @@ mod care;
 mod maps;
 mod corrections;
 mod looking;
+mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, View};
 pub(crate) use maps::{Map, Transfer};
+pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
 
 use crate::commands::demo::DemoArgs;
 use crate::commands::describe::Describe;
@@ -135,6 +137,12 @@ pub(crate) enum Command {
     Events(Events),
     /// Name the shape most worth labelling by hand next, and the reason
     Suggest(Suggest),
+    /// Ask for the label of one part after the other, those first whose answers are worth most
+    Ask(Ask),
+    /// Answer a question of `coseg ask`
+    Answer(AnswerQuestion),
+    /// Find all labels of a shape right, which makes it one that others are labelled from
+    Approve(Approve),
     /// Label a shape by hand, and propagate that to all others
     Correct(Correct),
     /// Give a label a name
@@ -143,8 +151,8 @@ pub(crate) enum Command {
     Merge(Merge),
     /// Split one label into two
     Split(Split),
-    /// Undo the newest correction, name, merge, split or change of the up axis; repeat to go
-    /// further back
+    /// Undo the newest correction, answer, verdict, name, merge, split or change of the up axis;
+    /// repeat to go further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]
@@ -383,6 +391,9 @@ pub(crate) struct Ls {
     /// Only shapes that have this label, an id or a name
     #[arg(long, value_name = "LABEL")]
     pub(crate) label: Option<String>,
+    /// Only shapes with this verdict by a person
+    #[arg(long, value_name = "STATE")]
+    pub(crate) review: Option<Verdict>,
 }
 
 /// `coseg show`
@@ -619,7 +630,9 @@ mod tests {
 
     #[test]
     fn one_collection_is_named_by_its_place_or_by_a_flag() {
-        for command in ["ls", "wait", "events", "watch", "suggest", "undo", "jobs"] {
+        for command in [
+            "ls", "wait", "events", "watch", "suggest", "ask", "undo", "jobs",
+        ] {
             for line in [
                 &["coseg", command, "chairs"][..],
                 &["coseg", command, "--collection", "chairs"],

@@ -1,5 +1,6 @@
 //! Defines the flags of commands that correct labels.
 
+use super::questions::Person;
 use super::{InCollection, OneCollection};
 use clap::Args;
 use std::path::PathBuf;
@@ -21,6 +22,8 @@ pub(crate) struct Correct {
     /// The label of that part: an id, or the name of an existing label
     #[arg(long, value_name = "LABEL", requires = "part")]
     pub(crate) label: Option<String>,
+    #[command(flatten)]
+    pub(crate) person: Person,
     /// Return once the correction is durable, before it has been propagated to the other shapes
     #[arg(long)]
     pub(crate) no_wait: bool,

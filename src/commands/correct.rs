@@ -43,6 +43,7 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
         collection: collection.clone(),
         shape: args.shape.clone(),
         correction: Some(correction),
+        by: args.person.name(),
     };
     let frames: Vec<Bytes> = frames.finish();
     let done = call!(session.client, CorrectLabels(request), frames, with_frames)?.0;

@@ -189,6 +189,23 @@ pub(super) fn original(
     shape: &str,
     n_labels: usize,
 ) -> Result<ParsedMesh, CommandError> {
+    let mesh = original_of(session, collection, shape)?;
+    if mesh.n_polygons != n_labels {
+        let n = mesh.n_polygons;
+        return Err(CommandError::Client(ClientError::BadReply(format!(
+            "{shape} has {n} faces, but {n_labels} labels by an earlier release: add it again with \
+             --replace"
+        ))));
+    }
+    Ok(mesh)
+}
+
+/// The mesh of a shape in its original form, which may have another number of faces than labels.
+pub(super) fn original_of(
+    session: &mut Session,
+    collection: &str,
+    shape: &str,
+) -> Result<ParsedMesh, CommandError> {
     let request = wire::GetOriginalRequest {
         collection: collection.to_owned(),
         shape: shape.to_owned(),
@@ -200,15 +217,7 @@ pub(super) fn original(
     let bytes = FrameReader::new(&frames)
         .file(reply.bytes.as_ref(), "bytes")
         .map_err(|e| bad(e.to_string()))?;
-    let mesh = parse(bytes, format).map_err(|e| bad(format!("{shape}: {e}")))?;
-    if mesh.n_polygons != n_labels {
-        let n = mesh.n_polygons;
-        return Err(bad(format!(
-            "{shape} has {n} faces, but {n_labels} labels by an earlier release: add it again with \
-             --replace"
-        )));
-    }
-    Ok(mesh)
+    parse(bytes, format).map_err(|e| bad(format!("{shape}: {e}")))
 }
 
 #[cfg(test)]

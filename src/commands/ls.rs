@@ -3,7 +3,7 @@
 use super::collections::warn_of_up;
 use super::session::Session;
 use super::{Outcome, json};
-use crate::cli::Ls;
+use crate::cli::{Ls, Verdict};
 use coseg::call;
 use coseg::ipc::convert::up_name;
 use coseg::ipc::wire;
@@ -11,13 +11,23 @@ use coseg::text::table;
 use serde_json::{Value, json};
 
 pub(crate) fn run(args: &Ls, mut session: Session) -> Outcome {
-    if args.of.named().is_none() && args.label.is_none() {
+    if args.of.named().is_none() && args.label.is_none() && args.review.is_none() {
         return collections(&mut session);
     }
     let collection = session.collection(&args.of.within())?;
     let label = args.label.as_ref();
     let label = label.map(|l| session.label(&collection, l)).transpose()?;
-    shapes(&collection, label, &mut session)
+    shapes(&collection, (label, wanted(args.review)), &mut session)
+}
+
+fn wanted(review: Option<Verdict>) -> wire::ReviewState {
+    match review {
+        None => wire::ReviewState::Unspecified,
+        Some(Verdict::Unseen) => wire::ReviewState::Unseen,
+        Some(Verdict::Corrected) => wire::ReviewState::Corrected,
+        Some(Verdict::Approved) => wire::ReviewState::Approved,
+        Some(Verdict::Doubtful) => wire::ReviewState::Doubtful,
+    }
 }
 
 fn collections(session: &mut Session) -> Outcome {
@@ -59,14 +69,32 @@ fn collections(session: &mut Session) -> Outcome {
     Ok(true)
 }
 
-fn shapes(collection: &str, label: Option<u32>, session: &mut Session) -> Outcome {
-    let shapes = session.shapes(collection, label)?;
+fn shapes(
+    collection: &str,
+    (label, review): (Option<u32>, wire::ReviewState),
+    session: &mut Session,
+) -> Outcome {
+    let shapes = session.shapes_reviewed(collection, label, review)?;
     if session.json {
         let list: Vec<Value> = shapes.iter().map(json::shape).collect();
         session.print_json(&json!({ "collection": collection, "shapes": list }))?;
         return Ok(true);
     }
-    let heading = ["shape", "faces", "parts", "labels", "version", "state"];
+    let mut counts = std::collections::BTreeMap::<String, usize>::new();
+    for s in &shapes {
+        let state = s
+            .review
+            .as_ref()
+            .map_or_else(Default::default, |r| r.state());
+        *counts.entry(json::review_state(state)).or_default() += 1;
+    }
+    let counts: Vec<String> = counts
+        .iter()
+        .map(|(state, n)| format!("{n} {state}"))
+        .collect();
+    let heading = [
+        "shape", "faces", "parts", "labels", "version", "state", "review",
+    ];
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
     for s in &shapes {
         let labels: std::collections::BTreeSet<u32> = s.parts.iter().map(|p| p.label).collect();
@@ -78,8 +106,14 @@ fn shapes(collection: &str, label: Option<u32>, session: &mut Session) -> Outcom
             labels.join(","),
             s.version.to_string(),
             if s.stale { "stale" } else { "current" }.to_owned(),
+            json::review_state(
+                s.review
+                    .as_ref()
+                    .map_or_else(Default::default, |r| r.state()),
+            ),
         ]);
     }
     session.line(&table(&rows))?;
+    eprintln!("{}", counts.join(", "));
     Ok(true)
 }

@@ -1,6 +1,8 @@
 //! Implements the subcommands, one file for each.
 
 mod add;
+mod approve;
+mod ask;
 mod check;
 mod collections;
 mod completions;
@@ -192,6 +194,9 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Events(args) => events::run(args, session()?),
         Command::Name(args) => name::run(args, session()?),
         Command::Suggest(args) => suggest::run(args, session()?),
+        Command::Ask(args) => ask::run(args, session()?),
+        Command::Answer(args) => ask::answer(args, session()?),
+        Command::Approve(args) => approve::run(args, session()?),
         Command::Correct(args) => correct::run(args, session()?),
         Command::Merge(args) => merge::merge(args, session()?),
         Command::Split(args) => merge::split(args, session()?),

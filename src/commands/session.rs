@@ -157,6 +157,16 @@ impl Session {
         collection: &str,
         label: Option<u32>,
     ) -> Result<Vec<wire::Shape>, CommandError> {
+        self.shapes_reviewed(collection, label, wire::ReviewState::Unspecified)
+    }
+
+    /// As [`Session::shapes`], with this verdict if one is specified.
+    pub(crate) fn shapes_reviewed(
+        &mut self,
+        collection: &str,
+        label: Option<u32>,
+        review: wire::ReviewState,
+    ) -> Result<Vec<wire::Shape>, CommandError> {
         let mut shapes = Vec::new();
         let mut page_token = String::new();
         loop {
@@ -166,6 +176,7 @@ impl Session {
                 page_size: 0,
                 page_token,
                 label,
+                review: review.into(),
             };
             let reply = call!(self.client, ListShapes(request))?;
             shapes.extend(reply.shapes);

@@ -17,10 +17,17 @@ pub(crate) fn run(args: &Undo, mut session: Session) -> Outcome {
         session.wait_until_idle(&collection)?;
     }
     if session.json {
-        let (change, n_left, sequence) = (&done.change, done.n_left, done.sequence);
-        session.print_json(&json!({ "undone": change, "n_left": n_left, "sequence": sequence }))?;
+        session.print_json(&json!({
+            "undone": done.change,
+            "subject": done.subject,
+            "n_left": done.n_left,
+            "sequence": done.sequence,
+        }))?;
     } else {
-        eprintln!("{} undone, {} changes left", done.change, done.n_left);
+        let (change, subject, n_left) = (&done.change, &done.subject, done.n_left);
+        let of = if subject.is_empty() { "" } else { " of " };
+        let changes = if n_left == 1 { "change" } else { "changes" };
+        eprintln!("{change}{of}{subject} undone, {n_left} {changes} left");
     }
     Ok(true)
 }

@@ -156,7 +156,7 @@ operations! {
             DescribeCollection(DescribeCollectionRequest),
             GetJob(GetJobRequest),
             ListJobs(ListJobsRequest),
-            ListShapes(ListShapesRequest),
+            ListShapes(ListShapesRequest) checked by check_reviews,
             GetShape(GetShapeRequest),
             GetLabels(GetLabelsRequest),
             EventsSince(EventsSinceRequest),
@@ -190,6 +190,7 @@ operations! {
             Nearest(NearestRequest),
             GetPortraits(GetPortraitsRequest) checked by check_portraits,
             SuggestNext(SuggestNextRequest),
+            NextQuestion(NextQuestionRequest),
         }
         /// Changes that take no work on shapes.
         Change {
@@ -200,6 +201,8 @@ operations! {
         Edit {
             UpdateCollection(UpdateCollectionRequest) checked by check_update,
             CorrectLabels(CorrectLabelsRequest) checked by check_correction,
+            AnswerQuestion(AnswerQuestionRequest),
+            ReviewShape(ReviewShapeRequest) checked by check_review,
             MergeLabels(MergeLabelsRequest),
             SplitLabel(SplitLabelRequest),
             Undo(UndoRequest),

@@ -147,7 +147,12 @@ fn list_shapes(
     // One more, to see whether there is another page.
     let mut shapes = daemon
         .library
-        .shapes(&r.collection, after, size + 1, r.label)
+        .shapes_reviewed(
+            &r.collection,
+            (after, size + 1),
+            r.label,
+            convert::wanted_review(r.review()),
+        )
         .map_err(refused)?;
     let more = shapes.len() > size;
     shapes.truncate(size);

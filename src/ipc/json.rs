@@ -78,6 +78,55 @@ pub fn shape(s: &wire::Shape) -> Value {
         "parts": parts.collect::<Vec<_>>(),
         "sources": sources.collect::<Vec<_>>(),
         "stored_bytes": s.stored_bytes,
+        "review": s.review.as_ref().map(review),
+    })
+}
+
+/// What a correction did.
+pub fn corrected(c: &wire::CorrectLabelsReply) -> Value {
+    json!({
+        "version": c.version,
+        "sequence": c.sequence,
+        "n_faces": c.n_faces,
+        "area_share": c.area_share,
+        "changed_share": c.changed_share,
+        "n_stale": c.n_stale,
+    })
+}
+
+/// A question about a part with these faces.
+pub fn question(q: &wire::NextQuestionReply, faces: &[u32]) -> Value {
+    let likeliest = q.likeliest.iter().map(|l| {
+        json!({
+            "label": l.label,
+            "name": Some(&l.name).filter(|n| !n.is_empty()),
+            "probability": l.probability,
+            "used": l.used,
+        })
+    });
+    json!({
+        "shape": q.shape,
+        "part": q.part,
+        "id": format!("{}:{}", q.shape, q.part),
+        "faces": faces,
+        "area_share": q.area_share,
+        "doubt": q.doubt,
+        "gain": q.gain,
+        "likeliest": likeliest.collect::<Vec<_>>(),
+        "n_answered": q.n_answered,
+    })
+}
+
+/// The state of a verdict in lower case.
+pub fn review_state(state: wire::ReviewState) -> String {
+    short(state.as_str_name(), "REVIEW_STATE_")
+}
+
+fn review(r: &wire::Review) -> Value {
+    json!({
+        "state": review_state(r.state()),
+        "by": r.by,
+        "unix_ms": r.unix_ms,
     })
 }
 

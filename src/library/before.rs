@@ -5,7 +5,7 @@ use super::collection::{Collection, ModelState, State, StoredState};
 use super::error::Result;
 use super::rows::{damaged, from_json, to_json};
 use super::types::LabelId;
-use crate::store::{CorrectionRow, LabelRow, Reader, ShapeId};
+use crate::store::{CorrectionRow, LabelRow, Reader, ReviewRow, ShapeId};
 use serde::{Deserialize, Serialize};
 
 /// A collection as it was before a change by a person.
@@ -40,6 +40,16 @@ pub(super) struct Rest {
     pub(super) stale: Vec<i64>,
     /// Pinned faces of the shapes that the change touches.
     pub(super) pins: Vec<(i64, Option<Vec<i32>>)>,
+    /// Verdicts on the shapes that the change touches.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub(super) reviews: Vec<(i64, Option<StoredReview>)>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct StoredReview {
+    state: String,
+    reviewer: String,
+    unix_ms: u64,
 }
 
 impl Before {
@@ -61,7 +71,7 @@ impl Before {
         })
     }
 
-    /// A collection before a change that touches the pinned faces of `shapes`.
+    /// A collection before a change that touches the pinned faces or the verdicts of `shapes`.
     pub(super) fn labels(
         reader: &Reader<'_>,
         collection: &Collection,
@@ -69,12 +79,17 @@ impl Before {
     ) -> Result<Self> {
         let stale = reader.stale_shapes(collection.id())?;
         let pins = shapes.iter().map(|s| Ok((s.0, reader.pins(*s)?)));
+        let reviews = shapes.iter().map(|s| {
+            let review = reader.review(*s)?.map(StoredReview::from);
+            Ok((s.0, review))
+        });
         let rest = Rest {
             state: collection.state().clone().into(),
             epoch: collection.row().epoch,
             next_ordinal: collection.row().next_ordinal,
             stale: stale.into_iter().map(|s| s.0).collect(),
             pins: pins.collect::<Result<_>>()?,
+            reviews: reviews.collect::<Result<_>>()?,
         };
         Ok(Self {
             rest: Some(rest),
@@ -127,6 +142,26 @@ impl Rest {
     }
 }
 
+impl From<ReviewRow> for StoredReview {
+    fn from(row: ReviewRow) -> Self {
+        Self {
+            state: row.state,
+            reviewer: row.reviewer,
+            unix_ms: row.unix_ms,
+        }
+    }
+}
+
+impl From<StoredReview> for ReviewRow {
+    fn from(stored: StoredReview) -> Self {
+        Self {
+            state: stored.state,
+            reviewer: stored.reviewer,
+            unix_ms: stored.unix_ms,
+        }
+    }
+}
+
 impl From<LabelRow> for StoredLabel {
     fn from(row: LabelRow) -> Self {
         Self {
@@ -167,6 +202,14 @@ mod tests {
             next_ordinal: 9,
             stale: vec![7],
             pins: vec![(5, Some(vec![-1, 3])), (6, None)],
+            reviews: vec![(
+                5,
+                Some(StoredReview {
+                    state: "approved".into(),
+                    reviewer: "ada".into(),
+                    unix_ms: 12,
+                }),
+            )],
         };
         let before = Before {
             rest: Some(rest),

@@ -17,8 +17,9 @@ use crate::pipeline::LabelChange;
 use crate::store::catalog::KIND_NAME;
 use crate::store::{
     CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, MapRow, NewShapeRow, ObjectRow,
-    ShapeId, Store, Tx,
+    ReviewRow, ShapeId, Store, Tx,
 };
+use std::collections::BTreeSet;
 
 /// What becomes true together. Fields are written, and their events logged, in this order.
 #[derive(Debug, Default)]
@@ -37,6 +38,8 @@ pub(super) struct Change {
     pub(super) labels: Vec<LabelEdit>,
     /// New pins of shapes; `None`: no face is pinned.
     pub(super) pins: Vec<(ShapeId, Option<Vec<i32>>)>,
+    /// New verdicts on shapes; `None`: nobody gave one.
+    pub(super) reviews: Vec<(ShapeId, Option<ReviewRow>)>,
     /// A shape that comes.
     pub(super) added: Option<Box<Addition>>,
     /// Maps between stored shapes.
@@ -63,6 +66,9 @@ pub(super) struct Change {
 #[derive(Debug)]
 pub(super) enum Undoable {
     Correct { shape: String },
+    Answer { shape: String },
+    Approve { shape: String },
+    Doubt { shape: String },
     Name,
     Merge { label: LabelId, into: LabelId },
     Split { label: LabelId, new: LabelId },
@@ -118,6 +124,9 @@ impl Undoable {
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Self::Correct { .. } => "correct",
+            Self::Answer { .. } => "answer",
+            Self::Approve { .. } => "approve",
+            Self::Doubt { .. } => "doubt",
             Self::Name => KIND_NAME,
             Self::Merge { .. } => "merge",
             Self::Split { .. } => "split",
@@ -127,7 +136,10 @@ impl Undoable {
 
     fn detail(&self) -> String {
         let detail = match self {
-            Self::Correct { shape } => serde_json::json!({ "shape": shape }),
+            Self::Correct { shape }
+            | Self::Answer { shape }
+            | Self::Approve { shape }
+            | Self::Doubt { shape } => serde_json::json!({ "shape": shape }),
             Self::Name => serde_json::json!({}),
             Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
             Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
@@ -191,11 +203,14 @@ impl Change {
             still_queued(tx, accepted)?;
         }
         if let Some(undoable) = &self.undoable {
-            let pins: Vec<ShapeId> = self.pins.iter().map(|p| p.0).collect();
+            let pinned = self.pins.iter().map(|p| p.0);
+            let touched: BTreeSet<ShapeId> =
+                pinned.chain(self.reviews.iter().map(|r| r.0)).collect();
+            let touched: Vec<ShapeId> = touched.into_iter().collect();
             let before = match undoable {
                 Undoable::Name => Before::names(tx.labels(id)?),
                 Undoable::Up { .. } => Before::up(tx, collection)?,
-                _ => Before::labels(tx, collection, &pins)?,
+                _ => Before::labels(tx, collection, &touched)?,
             };
             tx.insert_correction(id, undoable.kind(), &undoable.detail(), &before.encode())?;
         }
@@ -220,6 +235,9 @@ impl Change {
         }
         for (shape, pins) in &self.pins {
             tx.set_pins(*shape, pins.as_deref())?;
+        }
+        for (shape, review) in &self.reviews {
+            tx.set_review(*shape, review.as_ref())?;
         }
         let added = self.added.as_mut().map(|a| a.write(tx, id)).transpose()?;
         for map in &self.maps {

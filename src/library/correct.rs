@@ -10,13 +10,14 @@ use super::labelling::{NewLabels, Relabelled, area_shares, cause, face_ids};
 use super::once::{Request, answered, from_reply};
 use super::pins::{Instead, UsedLabels, pin_polygons, pinned_faces, pinned_share, used_labels};
 use super::reason::Reason;
+use super::review::{ReviewState, check_reviewer, review_row};
 use super::rows::to_json;
 use super::sources::{Known, Sources};
 use super::types::{EventKind, FailureSubject, LabelId, PartInfo, RequestKey};
 use crate::correspondence::parts;
 use crate::pipeline::DescriptionView;
 use crate::segmentation::Surface;
-use crate::store::{Digest, LabelSummary, LabelVersionRow, ShapeId};
+use crate::store::{Digest, LabelSummary, LabelVersionRow, ShapeId, Store};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -24,6 +25,7 @@ use std::collections::BTreeSet;
 pub const MAX_LABEL: u32 = 65_535;
 /// Most labels of a collection that a person can use.
 pub const MAX_LABELS: usize = 64;
+
 /// Labels that a person gives to faces of a shape.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Correction {
@@ -108,8 +110,8 @@ impl Correction {
 }
 
 /// A correction before it is written.
-struct Corrects {
-    change: Change,
+pub(super) struct Corrects {
+    pub(super) change: Change,
     /// Version of the shape's labels then.
     version: u64,
     n_faces: u64,
@@ -131,6 +133,22 @@ impl Library {
         correction: &Correction,
         key: Option<&RequestKey>,
     ) -> Result<Corrected> {
+        self.correct_by(collection, shape, correction, "", key)
+    }
+
+    /// [`Library::correct`] by the person `by`, which the shape's review says.
+    ///
+    /// # Errors
+    /// As there, or the person's name cannot be one.
+    pub fn correct_by(
+        &self,
+        collection: &str,
+        shape: &str,
+        correction: &Correction,
+        by: &str,
+        key: Option<&RequestKey>,
+    ) -> Result<Corrected> {
+        check_reviewer(by)?;
         let request = Request {
             earlier: Some(correction.digest_of_first_release(collection, shape)),
             ..Request::new(key, correction.digest(collection, shape))
@@ -141,33 +159,48 @@ impl Library {
                 return from_reply(&reply);
             }
             let id = self.shape_row(collection, shape)?.1.id;
-            let corrects = corrects(in_memory, &self.store, id, correction)?;
-            let Corrects {
-                change,
-                version,
-                n_faces,
-                area_share,
-                changed_share,
-            } = corrects;
-            let reply = commit_once(&self.store, in_memory, change, &request, |tx, now| {
-                let corrected = Corrected {
-                    version,
-                    sequence: now.row.sequence,
-                    n_faces,
-                    area_share,
-                    changed_share,
-                    n_stale: tx.n_stale(now.row.id)?,
-                    job: now.job,
-                };
-                Ok(to_json(&corrected).into_bytes())
-            })?;
+            let mut corrects = corrects(in_memory, &self.store, id, correction)?;
+            let review = review_row(ReviewState::Corrected, by);
+            corrects.change.reviews.push((id, Some(review)));
+            let reply = corrects.commit(&self.store, in_memory, &request, |done| to_json(&done))?;
             from_reply(&reply)
         })
     }
 }
 
+impl Corrects {
+    /// Writes the correction; `reply` makes the text that is stored as its reply.
+    pub(super) fn commit(
+        self,
+        store: &Store,
+        collection: &mut Collection,
+        request: &Request<'_>,
+        reply: impl FnOnce(Corrected) -> String,
+    ) -> Result<Vec<u8>> {
+        let Self {
+            change,
+            version,
+            n_faces,
+            area_share,
+            changed_share,
+        } = self;
+        commit_once(store, collection, change, request, |tx, now| {
+            let corrected = Corrected {
+                version,
+                sequence: now.row.sequence,
+                n_faces,
+                area_share,
+                changed_share,
+                n_stale: tx.n_stale(now.row.id)?,
+                job: now.job,
+            };
+            Ok(reply(corrected).into_bytes())
+        })
+    }
+}
+
 /// What a correction of one shape changes.
-fn corrects(
+pub(super) fn corrects(
     collection: &Collection,
     sources: &dyn Sources,
     id: ShapeId,

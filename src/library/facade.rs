@@ -4,6 +4,7 @@
 use super::collection::Collection;
 use super::error::{LibraryError, Named, Result};
 use super::lookup::{require_collection, require_shape};
+use super::questions::RememberedParts;
 use super::types::Placed;
 use crate::store::check::Finding;
 use crate::store::snapshot::Snapshot;
@@ -24,6 +25,8 @@ pub struct Library {
     pub(super) running: Mutex<HashMap<(u64, u32), String>>,
     pub(super) max_maps: AtomicU64,
     pub(super) max_relabelled: AtomicU64,
+    /// Parts of the shapes that questions were chosen from lately.
+    pub(super) parts: RememberedParts,
 }
 
 impl Library {
@@ -42,6 +45,7 @@ impl Library {
             running: Mutex::default(),
             max_maps: AtomicU64::new(0),
             max_relabelled: AtomicU64::new(0),
+            parts: RememberedParts::default(),
         }
     }
 

@@ -11,14 +11,17 @@ use super::reason::Reason;
 use super::rows::{damaged, to_json};
 use super::sources::Sources;
 use super::types::{EventKind, RequestKey};
-use crate::store::{CorrectionRow, LabelsBefore, ShapeId};
+use crate::store::{CorrectionRow, LabelsBefore, ReviewRow, ShapeId};
 use serde::{Deserialize, Serialize};
 
 /// What was undone.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
-    /// The change: `correct`, `name`, `merge`, `split` or `up`.
+    /// The change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split` or `up`.
     pub change: String,
+    /// What it changed: a shape, a label or an axis; empty for what an earlier version answered.
+    #[serde(default)]
+    pub subject: String,
     /// Changes by a person that can still be undone.
     pub n_left: u64,
     /// Sequence number of the collection after it.
@@ -56,6 +59,7 @@ impl Library {
             let reply = commit_once(&self.store, collection, change, &request, |tx, now| {
                 let undone = Undone {
                     change: newest.kind.clone(),
+                    subject: subject(&newest.detail_json),
                     n_left: tx.n_corrections(id)?,
                     sequence: now.row.sequence,
                 };
@@ -63,6 +67,19 @@ impl Library {
             })?;
             from_reply(&reply)
         })
+    }
+}
+
+/// The subject of a change, of its details as they are stored.
+fn subject(detail: &str) -> String {
+    let detail: serde_json::Value = serde_json::from_str(detail).unwrap_or_default();
+    let found = ["shape", "label", "from"]
+        .iter()
+        .find_map(|key| detail.get(key));
+    match found {
+        Some(serde_json::Value::String(name)) => name.clone(),
+        Some(value) => value.to_string(),
+        None => String::new(),
     }
 }
 
@@ -96,6 +113,12 @@ fn undoing(
     for (shape, pins) in &rest.pins {
         if collection.position(ShapeId(*shape)).is_some() {
             change.pins.push((ShapeId(*shape), pins.clone()));
+        }
+    }
+    for (shape, review) in &rest.reviews {
+        if collection.position(ShapeId(*shape)).is_some() {
+            let review = review.clone().map(ReviewRow::from);
+            change.reviews.push((ShapeId(*shape), review));
         }
     }
     let mut state: State = rest.state();

@@ -93,6 +93,12 @@ pub(super) fn from_reply<T: for<'de> Deserialize<'de>>(reply: &[u8]) -> Result<T
     from_json(text, "requests")
 }
 
+/// Milliseconds since 1970.
+pub(super) fn unix_ms() -> u64 {
+    let elapsed = SystemTime::now().duration_since(UNIX_EPOCH);
+    elapsed.map_or(0, |e| u64::try_from(e.as_millis()).unwrap_or(u64::MAX))
+}
+
 /// Now, in seconds since 1970.
 pub(super) fn unix_secs() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);

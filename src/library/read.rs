@@ -4,6 +4,7 @@ use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
 use super::labelling::face_ids;
 use super::lookup::{object_length, require_collection};
+use super::review::{Review, ReviewState};
 use super::rows::{
     confidence_of_row, damaged, format_from_name, from_json, quality_from_json, report_from_json,
 };
@@ -16,6 +17,7 @@ use crate::correspondence::{overlaps, part_of_vertex, parts};
 use crate::fmap::Quality;
 use crate::mesh::Format;
 use crate::segmentation::Surface;
+use crate::store::catalog::ReviewedAs;
 use crate::store::rows::confidence_from_u8;
 use crate::store::{LabelVersionRow, MappedDescription, ShapeRow};
 use std::sync::atomic::Ordering;
@@ -33,12 +35,41 @@ impl Library {
         limit: usize,
         label: Option<LabelId>,
     ) -> Result<Vec<ShapeInfo>> {
+        self.shapes_reviewed(collection, (after_ordinal, limit), label, None)
+    }
+
+    /// As [`Library::shapes`]; with `review`, only those with this verdict.
+    ///
+    /// # Errors
+    /// There is no such collection.
+    pub fn shapes_reviewed(
+        &self,
+        collection: &str,
+        (after_ordinal, limit): (u64, usize),
+        label: Option<LabelId>,
+        review: Option<ReviewState>,
+    ) -> Result<Vec<ShapeInfo>> {
         let id = self.collection_row(collection)?.id;
         self.store.catalog().read(|r| {
-            r.shapes(id, after_ordinal, limit, label)?
-                .into_iter()
-                .map(shape_info)
-                .collect()
+            let rows = match review {
+                None => r.shapes(id, after_ordinal, limit, label)?,
+                Some(state) => {
+                    let states = ReviewedAs {
+                        wanted: state.name(),
+                        pinned: ReviewState::Corrected.name(),
+                        unseen: ReviewState::Unseen.name(),
+                    };
+                    r.reviewed_shapes(id, (after_ordinal, limit), label, &states)?
+                }
+            };
+            let mut reviews = r.reviews(id)?;
+            let pinned = r.pinned_shapes(id)?;
+            let info = |row: ShapeRow| {
+                let is_pinned = pinned.binary_search(&row.id).is_ok();
+                let review = Review::of_row(reviews.remove(&row.id), is_pinned)?;
+                shape_info(row, review)
+            };
+            rows.into_iter().map(info).collect()
         })
     }
 
@@ -47,7 +78,12 @@ impl Library {
     /// # Errors
     /// There is no such collection or shape.
     pub fn shape(&self, collection: &str, shape: &str) -> Result<ShapeInfo> {
-        shape_info(self.shape_row(collection, shape)?.1)
+        let row = self.shape_row(collection, shape)?.1;
+        self.store.catalog().read(|r| {
+            let is_pinned = r.pins(row.id)?.is_some();
+            let review = Review::of_row(r.review(row.id)?, is_pinned)?;
+            shape_info(row, review)
+        })
     }
 
     /// The newest labels of a shape, or those of `version`.
@@ -318,7 +354,7 @@ fn labels(row: LabelVersionRow) -> Labels {
     }
 }
 
-fn shape_info(row: ShapeRow) -> Result<ShapeInfo> {
+fn shape_info(row: ShapeRow, review: Review) -> Result<ShapeInfo> {
     let place = format!("shapes {}", row.name);
     Ok(ShapeInfo {
         ordinal: row.ordinal,
@@ -331,6 +367,7 @@ fn shape_info(row: ShapeRow) -> Result<ShapeInfo> {
         parts: from_json(&row.parts_json, &place)?,
         sources: from_json(&row.sources_json, &place)?,
         stored_bytes: row.stored_bytes,
+        review,
         name: row.name,
     })
 }

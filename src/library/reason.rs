@@ -80,6 +80,7 @@ named!(
         NoVersion = "NO_VERSION",
         NonFiniteVertex = "NON_FINITE_VERTEX",
         NothingCorrected = "NOTHING_CORRECTED",
+        NothingToAsk = "NOTHING_TO_ASK",
         NothingToSuggest = "NOTHING_TO_SUGGEST",
         NothingToUndo = "NOTHING_TO_UNDO",
         NPartsRange = "N_PARTS_RANGE",

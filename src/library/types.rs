@@ -1,6 +1,7 @@
 //! The values that the library takes and returns: collections, shapes, labels, jobs, events.
 
 use super::reason::{Code, Reason};
+use super::review::Review;
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use serde::{Deserialize, Serialize};
@@ -188,6 +189,8 @@ pub struct ShapeInfo {
     pub sources: Vec<Source>,
     /// Bytes of its array file and of its compressed original.
     pub stored_bytes: u64,
+    /// A person's verdict on its labels.
+    pub review: Review,
 }
 
 /// A connected piece of one shape with one label.

@@ -118,8 +118,8 @@ pub struct Taught {
 pub struct Given<'a> {
     /// Statistics of faces that were labelled: pinned ones of further exemplars, and discovered ones that still count.
     pub statistics: &'a Statistics,
-    /// Exemplars, those among the lessons included.
-    pub n_exemplars: usize,
+    /// Training shapes, those among the lessons included: each counts by the share of its area that is pinned.
+    pub n_exemplars: f64,
     /// Statistics of the labels that were discovered before anything was labelled, over many shapes, where they count
     /// no more themselves: what parts are like on average, and how like parts of different shapes differ, of which a few
     /// exemplars say little.
@@ -135,7 +135,7 @@ pub fn teach(
     options: &TeachOptions,
 ) -> Taught {
     let worth = options.discovered_exemplars;
-    let share = worth / (worth + given.n_exemplars as f64);
+    let share = worth / (worth + given.n_exemplars);
     let scatter = given.discovered.map(Statistics::scatter_within);
     let with_scatter = |statistics: &Statistics| match &scatter {
         Some(scatter) => statistics.with_scatter(scatter, share),
@@ -163,7 +163,7 @@ pub fn teach(
     });
     if let Some(prior) = &prior {
         let translated = prior.translated();
-        let each = certain.total() / given.n_exemplars.max(1) as f64;
+        let each = certain.total() / given.n_exemplars.max(1e-3);
         let weight = worth * each / translated.total().max(1e-12);
         certain.accumulate(&translated, weight);
     }

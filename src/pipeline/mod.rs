@@ -3,6 +3,7 @@
 mod exemplars;
 mod literal;
 mod place;
+mod questions;
 mod recluster;
 mod split;
 
@@ -17,6 +18,9 @@ pub use exemplars::{
 pub use literal::literal;
 pub use place::{
     Labelling, Prepared, Vote, carried, label, map, map_by_descriptors, map_from, unlikeness,
+};
+pub use questions::{
+    AskedShape, Background, N_OFFERED, N_PARTS, Question, ShapeParts, next_question,
 };
 pub use recluster::{
     LabelChange, ReclusterOptions, Reclustering, Representative, batch, recluster,

@@ -49,7 +49,7 @@ pub use objects::{Kept, Objects};
 pub use rows::{
     CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
     LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
-    ObjectRow, PointMapRow, RequestRow, ShapeId, ShapeRow,
+    ObjectRow, PassedPart, PointMapRow, RequestRow, ReviewRow, ShapeId, ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

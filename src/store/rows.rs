@@ -232,6 +232,28 @@ pub struct CorrectionRow {
     pub before: Vec<u8>,
 }
 
+/// A person's verdict on the labels of a shape.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReviewRow {
+    /// What it is, as the library writes it.
+    pub state: String,
+    /// Who gave it, as the person said; may be empty.
+    pub reviewer: String,
+    /// When, in milliseconds since 1970.
+    pub unix_ms: u64,
+}
+
+/// A part that a person was asked about and did not label.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PassedPart {
+    /// Its shape.
+    pub shape: ShapeId,
+    /// Its number.
+    pub part: u32,
+    /// Why, as the library writes it.
+    pub why: String,
+}
+
 /// The newest labels a shape had before a correction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelsBefore {

@@ -12,7 +12,7 @@ const FRAME: &str = include_str!("page/page.html");
 /// The viewer's looks.
 pub const STYLE: &str = include_str!("page/style.css");
 /// The viewer's scripts, in the order in which they use each other.
-const SCRIPTS: [&str; 10] = [
+const SCRIPTS: [&str; 13] = [
     include_str!("page/address.js"),
     include_str!("page/data.js"),
     include_str!("page/mesh.js"),
@@ -21,6 +21,9 @@ const SCRIPTS: [&str; 10] = [
     include_str!("page/gallery.js"),
     include_str!("page/legend.js"),
     include_str!("page/stage.js"),
+    include_str!("page/strokes.js"),
+    include_str!("page/ask.js"),
+    include_str!("page/changes.js"),
     include_str!("page/panel.js"),
     include_str!("page/app.js"),
 ];

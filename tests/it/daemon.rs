@@ -2,6 +2,7 @@
 
 mod adding;
 mod answering;
+mod asking;
 mod correcting;
 mod flood;
 mod http_abuse;
@@ -239,6 +240,7 @@ fn what_is_not_there_or_not_allowed_is_named() {
             page_size,
             page_token,
             label,
+            review: 0,
         })
     };
     use ErrorCode::{AlreadyExists, InvalidArgument, NotFound};

@@ -2,6 +2,7 @@
 // Clippy recognises tests, but not their shared functions.
 #![allow(clippy::unwrap_used)]
 
+mod asking;
 mod cli;
 mod correcting;
 mod daemon;

@@ -269,6 +269,103 @@ if (what === "many") {
     await page.context().close();
   });
 
+  await test("questions are answered by keys, and a change is undone and done again by keys", async () => {
+    const page = await open(`${url}#chairs`);
+    const before = coseg("labels", first, "--collection", "chairs").labels;
+    const question = () => page.$eval("#controls", (c) => c.textContent);
+    await page.keyboard.press("q");
+    await page.waitForFunction(() => document.querySelector("#controls")?.textContent.includes("0 answered"));
+    const asked = new URL(page.url()).hash.split("/")[1];
+    await page.waitForSelector(`#stage[data-shown="${asked} ask"]`);
+    assert.ok((await colours(page, "#scene")) > 2);
+    await shot(page, "question");
+    const offered = await page.$$eval(".palette [data-answer]", (all) => all.length);
+    assert.ok(offered >= 1 && offered <= 3, await question());
+    await page.keyboard.press("n");
+    await page.keyboard.type("seat");
+    await page.keyboard.press("Enter");
+    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("1 answered"));
+    const seat = coseg("show", "--collection", "chairs").labels.find((l) => l.name === "seat").id;
+    assert.ok(coseg("labels", asked, "--collection", "chairs", "--no-wait").labels.includes(seat));
+    const inState = (state) => coseg("ls", "chairs", "--review", state).shapes.map((s) => s.name);
+    assert.deepEqual(inState("corrected"), [asked]);
+    await page.keyboard.press("s");
+    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("1 answered"));
+    await page.keyboard.press("1");
+    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("2 answered"));
+    await page.waitForSelector("#effect:not([hidden])");
+    for (const [keys, word, n] of [["Control+z", "Undone: answer", 1], ["Control+Shift+z", "Done again: answer", 2],
+      ["Control+z", "Undone: answer", 1], ["Control+z", "Undone: answer", 0]]) {
+      await page.evaluate(() => document.querySelectorAll(".toast").forEach((t) => t.remove()));
+      await page.keyboard.press(keys);
+      await page.waitForFunction((word) => [...document.querySelectorAll(".toast")].some((t) => t.textContent.startsWith(word)), word);
+      assert.equal(inState("corrected").length <= n, true, `${keys}: ${inState("corrected")}`);
+    }
+    coseg("wait", "--collection", "chairs");
+    assert.deepEqual(coseg("labels", first, "--collection", "chairs").labels, before);
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("a shape is approved by a key, found by its verdict, and → goes to the next shape", async () => {
+    const page = await open(`${url}#chairs`);
+    await page.focus(`.card[data-name="${first}"]`);
+    await page.keyboard.press("Enter");
+    await page.waitForSelector(`#stage[data-shown="${first} labels"]`);
+    await page.keyboard.press("ArrowRight");
+    await page.waitForSelector(`#stage[data-shown="${second} labels"]`);
+    await page.keyboard.press("y");
+    await page.waitForFunction(() => document.querySelector("#verdict")?.textContent.startsWith("approved"));
+    assert.match(await page.textContent(`.card[data-name="${second}"]`), /approved/);
+    await page.selectOption("#review", "approved");
+    await page.waitForFunction(() => document.querySelectorAll(".card").length === 1);
+    assert.match(await page.textContent("#count"), /1 of \d+ shapes, 1 approved/);
+    await shot(page, "approved");
+    await page.selectOption("#review", "");
+    coseg("wait", "--collection", "chairs");
+    await page.keyboard.press("Control+z");
+    await page.waitForFunction((name) => [...document.querySelectorAll(".toast")].some((t) => t.textContent.startsWith(`Undone: approve of ${name}.`)), second);
+    assert.deepEqual(coseg("ls", "chairs", "--review", "approved").shapes, []);
+    coseg("wait", "--collection", "chairs");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
+  await test("strokes are undone and done again, erased, and painted by keys", async () => {
+    const page = await open(`${url}#chairs`);
+    await select(page, first);
+    await mode(page, first, "correct");
+    const painted = () => page.$eval("#controls .ends", (e) => Number(/^([\d,]+) face/.exec(e.textContent)?.[1].replace(",", "") ?? 0));
+    await page.locator("#scene").focus();
+    await page.keyboard.press("2");
+    assert.equal(await page.getAttribute(".palette button:nth-child(2)", "aria-pressed"), "true");
+    const box = await page.locator("#scene").boundingBox();
+    const strokes = async () => {
+      for (let i = 0; i <= 12; i++) {
+        await page.mouse.move(box.x + box.width / 2, box.y + box.height * (0.2 + i * 0.05));
+        await page.mouse.down();
+        await page.mouse.up();
+      }
+    };
+    await strokes();
+    const all = await painted();
+    assert.ok(all > 0);
+    await page.keyboard.press("Control+z");
+    const less = await painted();
+    assert.ok(less < all, `${less} of ${all} faces after undo`);
+    await page.keyboard.press("Control+Shift+z");
+    assert.equal(await painted(), all);
+    await page.keyboard.press("e");
+    await strokes();
+    assert.equal(await painted(), 0);
+    await page.keyboard.press("Control+z");
+    assert.ok((await painted()) > 0, "erasing is a stroke too");
+    await shot(page, "strokes");
+    await page.click("#discard");
+    assert.deepEqual(page.faults, []);
+    await page.context().close();
+  });
+
   await test("other sites' pages change nothing", async () => {
     const body = JSON.stringify({ collection: "chairs" });
     const post = (headers) => fetch(`${url}api/undo`, { method: "POST", body, headers });

@@ -70,6 +70,9 @@ CALLS: dict[str, Call] = {
     "split_label": lambda _, c: c.split(1),
     "undo": lambda _, c: c.undo(),
     "suggest_next": lambda _, c: c.suggest(),
+    "next_question": lambda _, c: c.ask(),
+    "answer_question": lambda _, c: c.answer("a", 0, 1),
+    "review_shape": lambda _, c: c.approve("a"),
 }
 
 

@@ -8,11 +8,14 @@ import { BadReply, CosegError, EventLogRewound, NoAnswer, Refused } from "./erro
 import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import { EventSchema } from "./gen/coseg/v1/event_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
+import { ReviewState } from "./gen/coseg/v1/review_pb.js";
 import { PACE_MS, WAIT_MS, type Library } from "./library.js";
 import { added, failed, functionalMap, job, mapQuality, pointOptions, present, up } from "./replies.js";
 import type { Subscription } from "./transport.js";
 import type {
   Added,
+  Answer,
+  Answered,
   ChangedLabel,
   CollectionInfo,
   Corrected,
@@ -27,6 +30,7 @@ import type {
   Neighbor,
   PartMatches,
   Points,
+  Question,
   Settings,
   Shape,
   Snapshot,
@@ -35,12 +39,20 @@ import type {
   Transferred,
   Undone,
   Updated,
+  Verdict,
 } from "./types.js";
 import { FrameWriter, formatName, plain, type Encoded, type Matrix, type Mesh } from "./wire.js";
 
 /** Silence after which the client subscribes again; heartbeats come once a second. */
 const SILENCE_MS = 3_000;
 const HEARTBEAT_TOPIC = "\0";
+
+const VERDICTS: Record<Verdict, ReviewState> = {
+  unseen: ReviewState.UNSEEN,
+  corrected: ReviewState.CORRECTED,
+  approved: ReviewState.APPROVED,
+  doubtful: ReviewState.DOUBTFUL,
+};
 
 /** One collection of a library; created by {@link Library.collection}. */
 export class Collection {
@@ -184,8 +196,9 @@ export class Collection {
   }
 
   /** All shapes in the order of their arrival, or those that have a label. */
-  async *shapes(options: { label?: number | string } = {}): AsyncGenerator<Shape> {
-    const wish = options.label === undefined ? {} : { label: await this.#label(options.label) };
+  async *shapes(options: { label?: number | string; review?: Verdict } = {}): AsyncGenerator<Shape> {
+    const label = options.label === undefined ? {} : { label: await this.#label(options.label) };
+    const wish = { ...label, ...(options.review && { review: VERDICTS[options.review] }) };
     let pageToken = "";
     do {
       const [reply] = await this.library.call("listShapes", { collection: this.name, pageToken, ...wish });
@@ -404,6 +417,42 @@ export class Collection {
   /** Undoes the newest correction, name, merge, split or change of the up axis. */
   async undo(): Promise<Undone> {
     return plain((await this.library.call("undo", { collection: this.name }))[0]);
+  }
+
+  /** The part whose label is worth most to ask a person for, or undefined if there is none. */
+  async ask(options: { passed?: boolean } = {}): Promise<Question | undefined> {
+    try {
+      const request = { collection: this.name, passed: options.passed ?? false };
+      const [reply, raw] = await this.library.call("nextQuestion", request);
+      return { ...plain(reply), faces: raw.array(Uint32Array, reply.faces).data };
+    } catch (e) {
+      if (e instanceof Refused && e.reason === "NOTHING_TO_ASK") return undefined;
+      throw e;
+    }
+  }
+
+  /** Answers a question about a part of a shape. */
+  async answer(name: string, part: number, answer: Answer, options: { by?: string } = {}): Promise<Answered> {
+    const what =
+      "label" in answer
+        ? { case: "label" as const, value: await this.#label(answer.label) }
+        : "named" in answer
+          ? { case: "named" as const, value: answer.named }
+          : "skip" in answer
+            ? { case: "skip" as const, value: true }
+            : { case: "cutWrongly" as const, value: true };
+    const request = { collection: this.name, shape: name, part, answer: what, by: options.by ?? "" };
+    const [reply] = await this.library.call("answerQuestion", request);
+    const { label, corrected } = reply;
+    return { label, corrected: corrected && { ...plain(corrected), jobId: corrected.jobId } };
+  }
+
+  /** Takes all present labels of a shape as a person's; `doubtful` only notes that something is wrong with them. */
+  async approve(name: string, options: { doubtful?: boolean; by?: string } = {}): Promise<Corrected | undefined> {
+    const state = options.doubtful ? ReviewState.DOUBTFUL : ReviewState.APPROVED;
+    const request = { collection: this.name, shape: name, state, by: options.by ?? "" };
+    const [{ corrected }] = await this.library.call("reviewShape", request);
+    return corrected && { ...plain(corrected), jobId: corrected.jobId };
   }
 
   /** The shape that is most worth labelling by hand, or undefined if there is none. */

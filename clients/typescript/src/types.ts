@@ -8,6 +8,7 @@ import type {
 } from "./gen/coseg/v1/analysis_pb.js";
 import type { Collection as WireCollection, LabelInfo, UpdateCollectionReply } from "./gen/coseg/v1/collection_pb.js";
 import type { CorrectLabelsReply, SuggestNextReply, UndoReply } from "./gen/coseg/v1/correction_pb.js";
+import type { NextQuestionReply } from "./gen/coseg/v1/question_pb.js";
 import type { HelloReply, StatsReply } from "./gen/coseg/v1/daemon_pb.js";
 import type { Event as WireEvent } from "./gen/coseg/v1/event_pb.js";
 import type { Job as WireJob, WaitIdleReply } from "./gen/coseg/v1/job_pb.js";
@@ -52,6 +53,17 @@ export type Undone = Plain<UndoReply>;
 export type Updated = Plain<UpdateCollectionReply>;
 /** The shape that is most worth labelling by hand. */
 export type Suggestion = Plain<SuggestNextReply>;
+/** A person's verdict on the labels of a shape. */
+export type Verdict = "unseen" | "corrected" | "approved" | "doubtful";
+/** The part whose label is worth most to ask a person for; `faces` are its polygons. */
+export type Question = Omit<Plain<NextQuestionReply>, "faces"> & { readonly faces: Uint32Array };
+/** An answer to a question: a label by id or name, the name of one that may be new, or why the part is passed over. */
+export type Answer = { label: number | string } | { named: string } | { skip: true } | { cutWrongly: true };
+/** What an answer did: the label that the part has now, and the correction that this made. */
+export interface Answered {
+  readonly label?: number;
+  readonly corrected?: Corrected;
+}
 /** Whether a collection has work left. */
 export type Idle = Plain<WaitIdleReply>;
 

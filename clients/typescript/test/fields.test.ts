@@ -74,6 +74,9 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   splitLabel: (_, c) => c.split(1),
   undo: (_, c) => c.undo(),
   suggestNext: (_, c) => c.suggest(),
+  nextQuestion: (_, c) => c.ask(),
+  answerQuestion: (_, c) => c.answer("a", 0, { label: 1 }),
+  reviewShape: (_, c) => c.approve("a"),
 };
 
 async function first<T>(values: AsyncIterable<T>, n = N): Promise<T[]> {

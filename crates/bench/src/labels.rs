@@ -199,7 +199,7 @@ fn exemplars(args: &BenchLabels, category: &Category) -> Result<Vec<usize>, Benc
     }
 }
 
-fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
+pub(crate) fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
     values.clone().sum::<f64>() / values.count().max(1) as f64
 }
 

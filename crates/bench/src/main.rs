@@ -1,5 +1,6 @@
 //! `coseg-bench` compares labels and maps with known ones, and measures time.
 
+mod ask;
 mod carry;
 mod error;
 mod labels;
@@ -56,6 +57,8 @@ impl Global {
 enum Bench {
     /// Label meshes with known parts, streamed one by one, and compare
     Labels(labels::BenchLabels),
+    /// Stream meshes with known parts, answer questions about parts by the truth, and compare
+    Ask(ask::BenchAsk),
     /// Map meshes with known correspondence to each other, and compare
     Maps(maps::BenchMaps),
     /// Time the signatures of points, in comparison with copying the eigenvectors
@@ -68,6 +71,7 @@ enum Bench {
 fn run(cli: &Cli) -> Outcome {
     match &cli.bench {
         Bench::Labels(args) => labels::run(args, &cli.global),
+        Bench::Ask(args) => ask::run(args, &cli.global),
         Bench::Maps(args) => maps::run(args, &cli.global),
         Bench::Signatures(args) => signatures::run(args, &cli.global),
         Bench::Worker => unreachable!("invariant: main hands workers over before"),

@@ -108,6 +108,7 @@ impl Session {
                 page_size: 0,
                 page_token,
                 label: None,
+                review: wire::ReviewState::Unspecified.into(),
             };
             let reply = call!(self.client, ListShapes(request))?;
             names.extend(reply.shapes.into_iter().map(|s| s.name));

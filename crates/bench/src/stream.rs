@@ -42,7 +42,7 @@ pub(crate) struct Category {
 
 /// One mesh.
 pub(crate) struct Known {
-    name: String,
+    pub(crate) name: String,
     pub(crate) bytes: Bytes,
     pub(crate) format: wire::MeshFormat,
     pub(crate) mesh: TriMesh,
@@ -250,7 +250,7 @@ pub(crate) fn stream(
 }
 
 /// The labels of all shapes once no work is left; `None` for a missing shape.
-fn labels_now(
+pub(crate) fn labels_now(
     category: &Category,
     session: &mut Session,
 ) -> Result<Vec<Option<Vec<i32>>>, BenchError> {
@@ -299,6 +299,7 @@ pub(crate) fn with_exemplars(
                 collection: COLLECTION.to_owned(),
                 shape: suggested.shape,
                 correction: Some(Correction::Labels(labels)),
+                by: String::new(),
             };
             let frames = frames.finish();
             call!(session.client, CorrectLabels(request), frames, with_frames)?;

@@ -49,8 +49,8 @@ pub struct MeshSpectrum {
     pub operator: Laplacian,
 }
 
-/// Describes a mesh file. `stage` is told the name of each stage as it begins; when it returns false
-/// the work stops with [`DescribeError::Cancelled`].
+/// Describes a mesh file. `stage` is told the name of each stage as it begins; when it returns
+/// false the work stops with [`DescribeError::Cancelled`].
 ///
 /// # Errors
 /// Bytes that are no mesh, a mesh without area, a spectrum that cannot be proved complete.
@@ -155,8 +155,8 @@ fn entered(stage: &dyn Fn(&str) -> bool, name: &'static str) -> Result<(), Descr
     }
 }
 
-/// The spectrum of a mesh of area 1, with the stages `laplacian` and `spectrum`, and within the latter
-/// those of the solver: `spectrum.factor`, `spectrum.iterate` and so on, over and over.
+/// The spectrum of a mesh of area 1, with the stages `laplacian` and `spectrum`, and within the
+/// latter those of the solver: `spectrum.factor`, `spectrum.iterate` and so on, over and over.
 ///
 /// # Errors
 /// As [`laplacian`] and [`Eigenpairs::smallest`].

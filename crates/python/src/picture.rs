@@ -7,7 +7,8 @@ use numpy::{PyArray2, PyReadonlyArray2};
 use pyo3::prelude::{Bound, PyResult, Python, pyfunction};
 
 /// For each pixel `(height, width)` the face that is seen there, −1 where none is. The mesh is
-/// looked at along −z, x to the right and y up; its bounding box fills the picture but for a margin.
+/// looked at along −z, x to the right and y up; its bounding box fills the picture but for a
+/// margin.
 #[pyfunction]
 pub(crate) fn faces_in_sight<'py>(
     py: Python<'py>,

@@ -1,5 +1,5 @@
-//! Long work runs on a thread of its own; the caller waits without the interpreter's lock, looks for
-//! signals and reports progress.
+//! Long work runs on a thread of its own; the caller waits without the interpreter's lock, looks
+//! for signals and reports progress.
 
 use crate::failure::Failure;
 use coseg_geometry::spectrum::Progress;

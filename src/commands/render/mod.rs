@@ -92,6 +92,23 @@ fn picture(mesh: &ParsedMesh, colours: &[[u8; 3]], up: Option<[f64; 3]>) -> Canv
     view.draw(CELL, painted)
 }
 
+/// A shape with some of its polygons in colour, as PNG.
+pub(super) fn highlighted(
+    mesh: &ParsedMesh,
+    faces: &[u32],
+    up: wire::Up,
+) -> std::io::Result<Vec<u8>> {
+    const REST: [u8; 3] = [200; 3];
+    const CHOSEN: [u8; 3] = [230, 110, 0];
+    let mut colours = vec![REST; mesh.n_polygons];
+    for face in faces {
+        if let Some(colour) = colours.get_mut(*face as usize) {
+            *colour = CHOSEN;
+        }
+    }
+    picture(mesh, &colours, axis(up)).png()
+}
+
 fn columns(n_shapes: usize) -> usize {
     ((n_shapes as f64 * ASPECT).sqrt().ceil() as usize).clamp(1, n_shapes.max(1))
 }

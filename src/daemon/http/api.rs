@@ -3,6 +3,7 @@
 
 use super::hands::{Reserved, full};
 use super::page::unexpected;
+use super::questions::{AnswerBody, ReviewBody, answered, question};
 use super::runs::{Run, labels_of};
 use super::server::Server;
 use crate::ipc::convert;
@@ -72,7 +73,7 @@ impl Query<'_> {
     }
 }
 
-fn bad(reason: ErrorReason, field: &str, message: String) -> wire::Error {
+pub(super) fn bad(reason: ErrorReason, field: &str, message: String) -> wire::Error {
     convert::field_error(reason, field, message)
 }
 
@@ -116,6 +117,26 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
                 let found: Vec<Value> = found.map(|n| json!([n.shape, n.distance])).collect();
                 json!({ "neighbors": found })
             })
+            .await
+        }
+        "question" => {
+            let request = wire::NextQuestionRequest {
+                collection: query.text("collection")?,
+                passed: query.find("passed") == Some("true"),
+            };
+            let (reply, frames) = request!(server, NextQuestion(request))?;
+            let found = question(&reply, &frames)?;
+            json_of(server, move || found).await
+        }
+        "suggest" => {
+            let request = wire::SuggestNextRequest {
+                collection: query.text("collection")?,
+            };
+            let (reply, _) = request!(server, SuggestNext(request))?;
+            json_of(
+                server,
+                move || json!({ "shape": reply.shape, "reason": reply.reason }),
+            )
             .await
         }
         "events" => {
@@ -303,6 +324,21 @@ struct Correct {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
+struct Merge {
+    collection: String,
+    label: u32,
+    into: u32,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Split {
+    collection: String,
+    label: u32,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Undo {
     collection: String,
 }
@@ -344,16 +380,53 @@ pub(super) async fn change(server: &Server, path: &str, sent: Reserved<Vec<u8>>)
             .await
         }
         "correct" => correct(server, parsed(server, sent).await?).await,
+        "answer" => {
+            let request = parsed::<AnswerBody>(server, sent).await?.value.request()?;
+            let (reply, _) = request!(server, AnswerQuestion(request))?;
+            json_of(server, move || answered(&reply)).await
+        }
+        "review" => {
+            let request = parsed::<ReviewBody>(server, sent).await?.value.request()?;
+            let (reply, _) = request!(server, ReviewShape(request))?;
+            let corrected = reply.corrected;
+            json_of(
+                server,
+                move || json!({ "corrected": corrected.as_ref().map(json::corrected) }),
+            )
+            .await
+        }
+        "merge" => {
+            let change = parsed::<Merge>(server, sent).await?.value;
+            let request = wire::MergeLabelsRequest {
+                collection: change.collection,
+                label: change.label,
+                into: change.into,
+            };
+            let (reply, _) = request!(server, MergeLabels(request))?;
+            json_of(server, move || json!({ "n_shapes": reply.n_shapes })).await
+        }
+        "split" => {
+            let change = parsed::<Split>(server, sent).await?.value;
+            let request = wire::SplitLabelRequest {
+                collection: change.collection,
+                label: change.label,
+            };
+            let (reply, _) = request!(server, SplitLabel(request))?;
+            json_of(server, move || json!({ "n_shapes": reply.n_shapes })).await
+        }
         "undo" => {
             let change = parsed::<Undo>(server, sent).await?.value;
             let request = wire::UndoRequest {
                 collection: change.collection,
             };
             let (reply, _) = request!(server, Undo(request))?;
-            json_of(
-                server,
-                move || json!({ "change": reply.change, "n_left": reply.n_left }),
-            )
+            json_of(server, move || {
+                json!({
+                    "change": reply.change,
+                    "subject": reply.subject,
+                    "n_left": reply.n_left,
+                })
+            })
             .await
         }
         _ => Err(unknown(path)),
@@ -404,17 +477,8 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
         collection: correction.collection,
         shape: correction.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
+        by: String::new(),
     };
     let (done, _) = request!(server, CorrectLabels(request), Some(frames))?;
-    json_of(server, move || {
-        json!({
-            "version": done.version,
-            "sequence": done.sequence,
-            "n_faces": done.n_faces,
-            "area_share": done.area_share,
-            "changed_share": done.changed_share,
-            "n_stale": done.n_stale,
-        })
-    })
-    .await
+    json_of(server, move || json::corrected(&done)).await
 }

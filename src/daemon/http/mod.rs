@@ -11,6 +11,7 @@ mod door;
 mod guard;
 mod hands;
 mod page;
+mod questions;
 mod route;
 mod runs;
 mod server;

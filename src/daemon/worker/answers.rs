@@ -66,6 +66,10 @@ pub(super) fn compute(library: &Library, compute: Compute, sent: &[Bytes]) -> An
             let suggestion = library.suggest(&r.collection).map_err(refused)?;
             Reply::SuggestNext(convert::suggested(&suggestion))
         }
+        Compute::NextQuestion(r) => {
+            let question = library.next_question(&r.collection, r.passed);
+            Reply::NextQuestion(convert::question(&question.map_err(refused)?, &mut frames))
+        }
     };
     Ok((result, frames.finish()))
 }
@@ -86,9 +90,31 @@ pub(super) fn edit(
         Edit::CorrectLabels(r) => {
             let correction = convert::correction(&r, FrameReader::new(sent))?;
             let done = library
-                .correct(&r.collection, &r.shape, &correction, key)
+                .correct_by(&r.collection, &r.shape, &correction, &r.by, key)
                 .map_err(refused)?;
             Reply::CorrectLabels(convert::corrected(&done))
+        }
+        Edit::AnswerQuestion(r) => {
+            let answer = convert::answer(&r)?;
+            let done = library
+                .answer(&r.collection, (&r.shape, r.part), &answer, &r.by, key)
+                .map_err(refused)?;
+            Reply::AnswerQuestion(convert::answered(&done))
+        }
+        Edit::ReviewShape(r) => {
+            let corrected = match r.state() {
+                wire::ReviewState::Doubtful => {
+                    library
+                        .doubt(&r.collection, &r.shape, &r.by, key)
+                        .map_err(refused)?;
+                    None
+                }
+                _ => {
+                    let done = library.approve(&r.collection, &r.shape, &r.by, key);
+                    Some(convert::corrected(&done.map_err(refused)?))
+                }
+            };
+            Reply::ReviewShape(wire::ReviewShapeReply { corrected })
         }
         Edit::MergeLabels(r) => {
             let (label, n_shapes) = library

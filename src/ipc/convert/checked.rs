@@ -94,6 +94,32 @@ pub fn check_portraits(
     at_most("shapes", r.shapes.len(), MAX_PORTRAITS)
 }
 
+/// Checks a verdict on a shape: only some can be given.
+pub fn check_review(
+    r: &wire::ReviewShapeRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::ReviewState>(r.state, "state")?;
+    match r.state() {
+        wire::ReviewState::Approved | wire::ReviewState::Doubtful => Ok(()),
+        other => {
+            let text = format!(
+                "state is {}, but only approved and doubtful can be given",
+                other.as_str_name()
+            );
+            Err(field_error(ErrorReason::FieldRange, "state", text))
+        }
+    }
+}
+
+/// Checks a request for shapes.
+pub fn check_reviews(
+    r: &wire::ListShapesRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::ReviewState>(r.review, "review")
+}
+
 /// Rejects an enum value that this version does not know.
 fn known<T: TryFrom<i32>>(value: i32, field: &str) -> Result<(), wire::Error> {
     T::try_from(value).map(|_| ()).map_err(|_| {

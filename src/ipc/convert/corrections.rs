@@ -64,6 +64,7 @@ pub fn undone(u: &Undone) -> wire::UndoReply {
         change: u.change.clone(),
         n_left: u.n_left,
         sequence: u.sequence,
+        subject: u.subject.clone(),
     }
 }
 

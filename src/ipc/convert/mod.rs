@@ -7,6 +7,7 @@ mod corrections;
 mod errors;
 mod events;
 mod jobs;
+mod questions;
 mod shapes;
 
 pub use analysis::{
@@ -15,7 +16,7 @@ pub use analysis::{
 };
 pub use checked::{
     MAX_LANDMARKS, MAX_PORTRAITS, NamedFrames, check_addition, check_correction, check_creation,
-    check_map, check_portraits, check_transfer, check_update,
+    check_map, check_portraits, check_review, check_reviews, check_transfer, check_update,
 };
 pub use collections::{
     collection, collection_differs, collection_spec, label_info, new_up, parse_up, up_from_wire,
@@ -28,4 +29,5 @@ pub use jobs::{
     Ingest, ShapeInput, Source, add_shapes, carrying_job, format_from_wire, item, job_finished,
     mesh_format, new_shapes,
 };
+pub use questions::{answer, answered, question, review, wanted_review};
 pub use shapes::{clean_report, labels, labels_snapshot, original, shape};

@@ -1,6 +1,7 @@
 //! Converts shapes, their labels and their bytes.
 
 use super::jobs::mesh_format;
+use super::questions::review;
 use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire;
 use crate::library::{Labels, ShapeInfo};
@@ -57,6 +58,7 @@ pub fn shape(s: &ShapeInfo) -> wire::Shape {
         parts: parts.collect(),
         sources: sources.collect(),
         stored_bytes: s.stored_bytes,
+        review: Some(review(&s.review)),
     }
 }
 

@@ -14,7 +14,7 @@ use crate::labels::{Features, LabelModel, Normalisation, Statistics};
 use crate::library::change::{Change, map_row};
 use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause};
-use crate::library::pins::{pinned_faces, pins_of, used_labels};
+use crate::library::pins::{pinned_faces, pinned_share, pins_of, used_labels};
 use crate::library::rows::damaged;
 use crate::library::sources::{Known, Sources};
 use crate::library::types::LabelId;
@@ -247,7 +247,7 @@ impl Fit<'_> {
         let discovered = self.discovered_statistics(&model)?;
         let given = Given {
             statistics: &statistics,
-            n_exemplars: self.collection.shapes().iter().filter(|s| s.pinned).count(),
+            n_exemplars: self.n_training(&members)?,
             discovered: discovered.as_ref(),
         };
         let fitted = teach(&lessons, &maps, &given, k, &TeachOptions::default());
@@ -407,6 +407,21 @@ impl Fit<'_> {
             }
         }
         Ok(evidence)
+    }
+
+    /// Number of training shapes, each by the share of its area that is pinned.
+    fn n_training(&self, members: &[Member]) -> Result<f64> {
+        let mut n = 0.0;
+        for (at, shape) in self.collection.shapes().iter().enumerate() {
+            if !shape.pinned {
+                continue;
+            }
+            n += match members.iter().find(|m| m.at == at) {
+                Some(member) => pinned_share(&member.known.view(), &member.pins),
+                None => pinned_share(&self.sources.known(shape.id)?.view(), &self.pins(at)?),
+            };
+        }
+        Ok(n)
     }
 
     /// Statistics of the labels as they were when discovery ended, where shapes cannot carry those

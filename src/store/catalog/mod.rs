@@ -12,6 +12,7 @@ mod labels;
 pub(in crate::store) mod log;
 mod maps;
 mod reader;
+mod reviews;
 pub(crate) mod schema;
 mod shapes;
 pub(in crate::store) mod witness;
@@ -20,6 +21,7 @@ pub use corrections::KIND_NAME;
 pub use labels::KEPT_LABEL_VERSIONS;
 pub use reader::{Reader, Tx};
 pub use schema::CATALOG_FORMAT;
+pub use shapes::ReviewedAs;
 
 use super::error::CATALOG_FILE;
 use super::{Health, StoreError};

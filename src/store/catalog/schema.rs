@@ -11,7 +11,7 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are rejected.
-pub const CATALOG_FORMAT: u32 = 3;
+pub const CATALOG_FORMAT: u32 = 4;
 
 /// The format before corrections: it lacks the tables in [`SINCE_FORMAT_2`].
 const WITHOUT_CORRECTIONS: u32 = 1;
@@ -19,6 +19,9 @@ const WITHOUT_CORRECTIONS: u32 = 1;
 /// The format before maps had a confidence for each vertex: it lacks the tables in
 /// [`SINCE_FORMAT_3`].
 const WITHOUT_CONFIDENCE: u32 = 2;
+
+/// The format before verdicts of persons: it lacks the tables in [`SINCE_FORMAT_4`].
+const WITHOUT_REVIEWS: u32 = 3;
 
 /// `cseg`, the application id in the header of the SQLite file.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -165,6 +168,14 @@ tables! {
      collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE, kind TEXT NOT NULL,
      detail TEXT NOT NULL, before BLOB NOT NULL, sum INTEGER"
 
+    REVIEWS "reviews" key 1 ["shape_id", "state", "reviewer", "unix_ms"]
+    "shape_id INTEGER PRIMARY KEY REFERENCES shapes ON DELETE CASCADE, state TEXT NOT NULL,
+     reviewer TEXT NOT NULL, unix_ms INTEGER NOT NULL, sum INTEGER"
+
+    PASSED_PARTS "passed_parts" key 2 ["shape_id", "part", "why"]
+    "shape_id INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part INTEGER NOT NULL,
+     why TEXT NOT NULL, sum INTEGER, PRIMARY KEY (shape_id, part)"
+
     LABELS_BEFORE "labels_before" key 2 [
         "correction_id", "shape_id", "version", "label_epoch", "parts", "area_shares",
     ]
@@ -228,6 +239,9 @@ const SINCE_FORMAT_3: [&Table; 2] = [&MAP_CONFIDENCE, &POINT_MAPS];
 const INDEXES_SINCE_FORMAT_3: &str = "
     CREATE INDEX point_maps_by_to ON point_maps (to_shape);
 ";
+
+/// Tables that format 4 added.
+const SINCE_FORMAT_4: [&Table; 2] = [&REVIEWS, &PASSED_PARTS];
 
 const INDEXES: &str = "
     CREATE INDEX stale_shapes ON shapes (collection_id, ordinal) WHERE stale;
@@ -299,7 +313,10 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
         connection.pragma_query_value(None, name, |row| row.get(0))
     };
     let found = pragma("user_version")?;
-    let is_old = matches!(found, WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE);
+    let is_old = matches!(
+        found,
+        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS
+    );
     if pragma("application_id")? != APPLICATION_ID || !is_old {
         return Ok(());
     }
@@ -310,10 +327,15 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
         }
         tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
     }
-    for table in SINCE_FORMAT_3 {
+    if found < WITHOUT_REVIEWS {
+        for table in SINCE_FORMAT_3 {
+            tx.execute_batch(&table.create())?;
+        }
+        tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
+    }
+    for table in SINCE_FORMAT_4 {
         tx.execute_batch(&table.create())?;
     }
-    tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
     tx.execute(
         "UPDATE meta SET value = ?1 WHERE key = 'format'",
         [CATALOG_FORMAT.to_string()],

@@ -43,6 +43,17 @@ pub(super) fn shape_row(fields: &Fields<'_>) -> Result<ShapeRow> {
     })
 }
 
+/// States of verdicts, as the library writes them.
+#[derive(Debug, Clone, Copy)]
+pub struct ReviewedAs<'a> {
+    /// The state of the wanted shapes.
+    pub wanted: &'a str,
+    /// The state of shapes that have pins and no verdict, as an earlier version left them.
+    pub pinned: &'a str,
+    /// The state of shapes that have neither.
+    pub unseen: &'a str,
+}
+
 fn object_row(fields: &Fields<'_>) -> Result<ObjectRow> {
     Ok(ObjectRow {
         kind: fields.get("kind")?,
@@ -93,6 +104,30 @@ impl Reader<'_> {
                 )
             }
         }
+    }
+
+    /// As [`Reader::shapes`], of those with a verdict in one state.
+    pub fn reviewed_shapes(
+        &self,
+        collection: CollectionId,
+        (after_ordinal, limit): (u64, usize),
+        label: Option<u32>,
+        state: &ReviewedAs<'_>,
+    ) -> Result<Vec<ShapeRow>> {
+        let after = i64::try_from(after_ordinal).unwrap_or(i64::MAX);
+        let limit = i64::try_from(limit).unwrap_or(i64::MAX);
+        let tail = "WHERE collection_id = ?1 AND ordinal > ?2 AND (?4 IS NULL OR EXISTS (
+                      SELECT 1 FROM shape_labels WHERE shape_id = shapes.id AND label = ?4))
+                    AND coalesce((SELECT state FROM reviews WHERE shape_id = shapes.id),
+                      CASE WHEN EXISTS (SELECT 1 FROM pins WHERE shape_id = shapes.id)
+                      THEN ?6 ELSE ?7 END) = ?5 ORDER BY ordinal LIMIT ?3";
+        let ReviewedAs {
+            wanted,
+            pinned,
+            unseen,
+        } = state;
+        let values = params![collection, after, limit, label, wanted, pinned, unseen];
+        self.all(&SHAPES, tail, values, shape_row)
     }
 
     /// The stale shape of lowest ordinal, in one collection or in all (the oldest collection

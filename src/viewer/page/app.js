@@ -17,6 +17,8 @@ class App {
     this.shapes = [];
     this.cache = new Map();
     this.thumbnails = new Thumbnails(this);
+    this.changes = new Changes(this);
+    this.asker = new Asker(this);
     this.gallery = new Gallery(this);
     this.stage = new Stage(this);
     this.panel = new Panel(this);
@@ -110,8 +112,8 @@ class App {
     if (this.name) select.value = this.name;
     select.hidden = names.length === 0;
     const edit = this.source.live && library.edit;
-    $("undo").hidden = !edit;
-    document.querySelector("[data-mode=correct]").hidden = !edit;
+    for (const id of ["undo", "redo", "ask", "suggest", "approve"]) $(id).hidden = !edit;
+    for (const mode of ["correct", "ask"]) document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
     this.edit = edit;
   }
 
@@ -130,6 +132,9 @@ class App {
     const ticket = (this.loading = {});
     [this.portraits, this.cache, this.log] = [new Map(), new Map(), []];
     $("collections").value = name;
+    this.changes.forget();
+    this.asker.question = null;
+    this.changes.show();
     this.gallery.show([]);
     const found = await this.source.collection(name);
     if (this.loading !== ticket) return;
@@ -187,7 +192,9 @@ class App {
     const names = (s) => `${s.name} ${s.parts.map((p) => this.labelName(p.label)).join(" ")}`.toLowerCase();
     let found = this.shapes.filter((s) => words.every((w) => names(s).includes(w)));
     if (this.only !== undefined) found = found.filter((s) => s.parts.some((p) => p.label === this.only));
+    if (this.view.review) found = found.filter((s) => (s.review?.state ?? "unseen") === this.view.review);
     const orders = {
+      moved: (a, b) => this.changes.moved(b.name) - this.changes.moved(a.name),
       name: (a, b) => a.name.localeCompare(b.name, "en", { numeric: true }),
       doubt: (a, b) => certainty(a) - certainty(b),
       changed: (a, b) => b.version - a.version,
@@ -197,7 +204,9 @@ class App {
     this.found = found;
     this.gallery.show(found);
     const all = this.nStored;
-    $("count").textContent = found.length === all ? `${all} shapes` : `${found.length} of ${all} shapes`;
+    const approved = this.shapes.filter((s) => s.review?.state === "approved").length;
+    const verdicts = approved ? `, ${approved} approved` : "";
+    $("count").textContent = (found.length === all ? counted(all, "shape") : `${found.length} of ${counted(all, "shape")}`) + verdicts;
     if (this.shapes.length && found.length === 0) this.empty("Nothing found", "No shape has this name or label.");
     else if (this.shapes.length) this.empty();
   }
@@ -211,7 +220,7 @@ class App {
     const word = /^[\p{L}\p{N}_.][\p{L}\p{N}_.-]*$/u.test(about.name);
     const name = word ? about.name : `'${about.name.replaceAll("'", "'\\''")}'`;
     $("warning").replaceChildren(
-      `This collection was given up ${about.up}, but ${percent(other.agreement)} of its shapes stand along ${other.up}. If they do, this finds the labels again: `,
+      `This collection was given up ${about.up}, but ${percent(other.agreement)} of the shapes that were clustered last stand along ${other.up}. If they do, this finds the labels again: `,
       make("code", {}, `coseg collections set ${name} --up ${other.up}`));
   }
 
@@ -251,6 +260,7 @@ class App {
     if (unknown) this.toast(`There is no collection “${unknown}” here.`, true);
     if (view.collection !== this.name) return this.load(view.collection);
     if (dims) this.legend.show();
+    $("review").value = view.review ?? "";
     const wanted = writeAddress({ ...view, collection: null, shape: null });
     if (wanted !== this.filtered) this.filter();
     if (dims) this.recolour();
@@ -335,10 +345,32 @@ class App {
     const shape = this.shape(this.selected);
     const body = { collection: this.name, shape: shape.name, n_polygons: shape.n_polygons, runs: stage.runs() };
     await this.attempt(async () => {
-      const done = await this.source.change("correct", body);
+      const done = await this.changes.send("correct", body);
       stage.painted.clear();
-      this.toast(`${percent(done.area_share)} of ${shape.name} is labelled by hand; ${done.n_stale} shapes follow.`);
+      this.toast(`${percent(done.area_share)} of ${shape.name} is labelled by hand; ${followers(done, shape)}.`);
       await this.reload();
+    });
+  }
+
+  /** Takes the shape's labels as right, all of them. */
+  approve() {
+    const shape = this.shape(this.selected);
+    if (!shape || !this.edit || this.stage.painted.size) return;
+    return this.attempt(async () => {
+      const body = { collection: this.name, shape: shape.name, state: "approved" };
+      const { corrected } = await this.changes.send("review", body);
+      this.toast(`${shape.name} is approved; ${followers(corrected, shape)}.`);
+      await this.reload();
+    });
+  }
+
+  /** Goes to the shape that is most worth labelling. */
+  suggest() {
+    if (!this.edit) return;
+    return this.attempt(async () => {
+      const { shape, reason } = await this.source.suggest(this.name);
+      await this.go({ shape, view: "correct", detail: null });
+      this.toast(`${shape}: ${reason}.`);
     });
   }
 
@@ -398,14 +430,17 @@ class App {
     const changed = this.shapes.filter((s) => this.portraits.get(s.name)?.version !== s.version).map((s) => s.name);
     for (let i = 0; i < changed.length; i += 16)
       for (const portrait of await this.source.portraitsOf(this.name, changed.slice(i, i + 16))) {
+        this.changes.replaced(this.portraits.get(portrait.name));
         this.portraits.set(portrait.name, portrait);
         this.gallery.draw(portrait.name, true);
       }
+    await this.changes.show();
+    if (this.view.order === "moved") this.filter();
     const { selected } = this;
     if (!selected) return;
     if (!this.byName.has(selected)) return this.go({ shape: null }, { replace: true });
     this.panel.show(selected);
-    const shown = ["labels", "history", "correct"].includes(this.stage.mode);
+    const shown = ["labels", "history", "correct", "ask"].includes(this.stage.mode);
     if (changed.includes(selected) && shown && this.stage.painted.size === 0) await this.stage.refresh();
     else this.panel.showControls();
   }
@@ -421,12 +456,12 @@ class App {
     $("skip").onfocus = () => ($("skip").textContent = this.selected ? "Skip to the shape" : "Skip to the shapes");
     $("skip").onclick = () => (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
     $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
-    $("undo").onclick = () => this.attempt(async () => {
-      if (!confirm("Take the newest change by a person back? This cannot be redone.")) return;
-      const undone = await this.source.change("undo", { collection: this.name });
-      this.toast(`Undone: ${undone.change}. ${undone.n_left} changes before it can be undone.`);
-      await this.reload();
-    });
+    $("review").onchange = () => this.go({ review: $("review").value || null }, { replace: true });
+    $("undo").onclick = () => this.changes.undo();
+    $("redo").onclick = () => this.changes.redo();
+    $("ask").onclick = () => this.attempt(() => this.asker.next());
+    $("suggest").onclick = () => this.suggest();
+    $("approve").onclick = () => this.approve();
     const tabs = [...document.querySelectorAll("[data-mode]")];
     for (const tab of tabs) tab.onclick = () => this.go({ view: tab.dataset.mode, detail: null });
     document.querySelector("[role=tablist]").onkeydown = (event) => {
@@ -437,18 +472,40 @@ class App {
       shown[next].focus();
       shown[next].click();
     };
-    document.addEventListener("keydown", (event) => {
-      const modified = event.ctrlKey || event.altKey || event.metaKey || event.shiftKey;
-      if (!this.selected || modified || event.defaultPrevented) return;
-      if (/INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
-      if (event.key === "Escape") $("close").click();
-      if (event.target.closest("#gallery, [role=tablist]")) return;
-      if (event.key === "ArrowLeft") this.step(-1);
-      if (event.key === "ArrowRight") this.step(1);
-    });
+    document.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("popstate", () => this.attempt(() => this.follow()));
     window.addEventListener("resize", () => this.gallery.redraw());
   }
+
+  /** Keys that mean the same wherever the focus is, but for fields. */
+  key(event) {
+    if (/INPUT|SELECT|TEXTAREA/.test(event.target.tagName) || event.defaultPrevented) return;
+    if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
+      event.preventDefault();
+      return event.shiftKey ? this.changes.redo() : this.changes.undo();
+    }
+    if (event.ctrlKey || event.altKey || event.metaKey || event.shiftKey) return;
+    if (this.edit && this.loaded) {
+      if (event.key === "q") return this.attempt(() => this.asker.next());
+      if (event.key === "g") return this.suggest();
+      if (event.key === "v" && this.changes.newest) return this.changes.toggle();
+    }
+    if (!this.selected) return;
+    if (event.key === "Escape") $("close").click();
+    if (this.edit && event.key === "y") return this.approve();
+    if (this.stage.mode === "ask" && this.asker.key(event.key)) return event.preventDefault();
+    if (this.stage.mode === "correct" && this.panel.paintKey(event.key)) return;
+    if (event.target.closest("[role=tablist]")) return;
+    // Arrows move between cards only while no shape is open.
+    if (event.key === "ArrowLeft") this.step(-1);
+    if (event.key === "ArrowRight") this.step(1);
+  }
+}
+
+/** How many other shapes follow a correction of this one, which may wait itself. */
+function followers(done, shape) {
+  const n = done.n_stale - (done.n_faces < shape.n_polygons ? 1 : 0);
+  return `${counted(n, "other shape")} ${n === 1 ? "follows" : "follow"}`;
 }
 
 function rgb(text) {

@@ -181,6 +181,14 @@ class LiveSource {
     return this.pack("map", { collection, from, to });
   }
 
+  question(collection) {
+    return this.json("question", { collection });
+  }
+
+  suggest(collection) {
+    return this.json("suggest", { collection });
+  }
+
   async nearest(collection, shape) {
     return (await this.json("nearest", { collection, shape, limit: 6 })).neighbors;
   }

@@ -78,7 +78,7 @@ class Thumbnails {
     const sizes = new Map([...this.waiting.keys()].map((canvas) => [canvas, this.size(canvas)]));
     for (const [canvas, name] of this.waiting) {
       this.waiting.delete(canvas);
-      const portrait = this.app.portraits.get(name);
+      const portrait = this.app.changes.before(name) ?? this.app.portraits.get(name);
       try {
         if (portrait && canvas.isConnected) this.draw(canvas, portrait, sizes.get(canvas));
       } catch (error) {
@@ -135,6 +135,8 @@ class Gallery {
       if (card) app.go({ shape: card.dataset.name, detail: null });
     });
     this.root.addEventListener("keydown", (event) => {
+      // Beside an open shape these go to other shapes.
+      if (app.selected && /^Arrow(Left|Right)$/.test(event.key)) return;
       const cards = [...this.root.children];
       const columns = getComputedStyle(this.root).gridTemplateColumns.split(" ").length;
       const at = cards.indexOf(event.target);
@@ -181,7 +183,8 @@ class Gallery {
     name.textContent = shown(shape.name);
     card.title = `${shape.name}: ${shape.n_polygons} faces, ${shape.parts.length} parts`;
     const doubt = certainty(shape) < 0.6;
-    mark.textContent = shape.stale ? "waiting" : doubt ? "unsure" : "";
+    const verdict = { approved: "✓ approved", doubtful: "? doubtful", corrected: "✎ corrected" }[shape.review?.state];
+    mark.textContent = shape.stale ? "waiting" : verdict ?? (doubt ? "unsure" : "");
     mark.classList.toggle("doubt", doubt && !shape.stale);
     card.setAttribute("aria-current", String(this.app.selected === shape.name));
   }

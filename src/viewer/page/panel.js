@@ -33,7 +33,8 @@ class Panel {
     keepingFocus(this.root, () => this.root.replaceChildren(
       make("h2", {}, name),
       make("div", { className: "facts" },
-        `${shape.n_polygons.toLocaleString("en")} faces · labels version ${shape.version}${state}`),
+        `${counted(shape.n_polygons, "face")} · labels version ${shape.version}${state}`),
+      make("div", { className: "facts", id: "verdict" }, verdictText(shape.review)),
       ...sections,
     ));
     const [neighbours, events] = await Promise.all([
@@ -127,6 +128,7 @@ class Panel {
       bar(SEQUENTIAL), make("span", { className: "quiet" }, "little to much heat left"));
     else if (stage.mode === "map") this.mapControls(box);
     else if (stage.mode === "correct") this.paintControls(box);
+    else if (stage.mode === "ask") app.asker.controls(box);
     else
       box.replaceChildren(make("span", { className: "quiet" },
         "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over. " +
@@ -189,14 +191,19 @@ class Panel {
       brush.label = label;
       this.showControls();
     };
+    const all = [...ids, fresh];
+    this.choices = all;
     const entry = (label, text) => {
+      const at = all.indexOf(label);
+      const key = at < 9 ? make("kbd", {}, String(at + 1)) : null;
       const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label },
-        swatch(this.app.colour(label)), text);
+        key, swatch(this.app.colour(label)), text);
       button.onclick = () => choose(label);
       return button;
     };
     const tool = make("select", { "aria-label": "Tool" },
-      make("option", { value: "brush" }, "Brush"), make("option", { value: "part" }, "Whole part"));
+      make("option", { value: "brush" }, "Brush (b)"), make("option", { value: "part" }, "Fill a part (f)"),
+      make("option", { value: "eraser" }, "Eraser (e)"));
     tool.value = brush.tool;
     tool.onchange = () => {
       brush.tool = tool.value;
@@ -217,12 +224,33 @@ class Panel {
     this.paintedChanged();
   }
 
+  /** Takes a key for painting; true if it meant something. */
+  paintKey(key) {
+    const { stage } = this.app;
+    const { brush } = stage;
+    const tool = { b: "brush", f: "part", e: "eraser" }[key];
+    const label = /^[1-9]$/.test(key) ? this.choices?.[Number(key) - 1] : undefined;
+    const size = { "[": 1 / 1.25, "]": 1.25 }[key];
+    if (tool) brush.tool = tool;
+    else if (label !== undefined) brush.label = label;
+    else if (size) brush.size = Math.min(Math.max(brush.size * size, 0.02), 0.5);
+    else if (key === "Enter" && stage.painted.size && document.activeElement === stage.canvas) this.app.correct();
+    else return false;
+    this.showControls();
+    return true;
+  }
+
   paintedChanged() {
     const n = this.app.stage.painted.size;
     if (!this.apply) return;
     this.apply.disabled = this.discard.disabled = n === 0;
-    this.amount.textContent = n ? `${n} faces painted` : "paint on the shape, or press its parts in the list; drag beside it to turn";
+    this.amount.textContent = n ? `${counted(n, "face")} painted` : "paint on the shape, or press its parts in the list; drag beside it to turn";
   }
+}
+
+/** A number with its noun. */
+function counted(n, noun) {
+  return `${n.toLocaleString("en")} ${noun}${n === 1 ? "" : "s"}`;
 }
 
 function slider(text, value, count, changed, shown) {
@@ -277,6 +305,14 @@ function labelEvent(e, app) {
     case "up_changed": return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
     default: return null;
   }
+}
+
+/** A person's verdict, with who gave it and when. */
+function verdictText(review) {
+  if (!review || review.state === "unseen") return "nobody has given a verdict";
+  const by = review.by ? ` by ${review.by}` : "";
+  const at = review.unix_ms ? `, ${new Date(review.unix_ms).toLocaleString()}` : "";
+  return `${review.state}${by}${at}`;
 }
 
 function meshText(shape) {

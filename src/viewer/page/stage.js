@@ -21,7 +21,7 @@ class Stage {
     this.time = null;
     this.carried = "labels";
     this.brush = { label: null, size: 0.1, tool: "brush" };
-    this.painted = new Map();
+    this.painted = new Strokes();
     this.listen();
   }
 
@@ -103,11 +103,15 @@ class Stage {
   async build(mode, name, portrait, ticket) {
     const { app } = this;
     const proxy = new Mesh(portrait, app.up);
-    if (mode === "labels" || mode === "history" || mode === "correct") {
+    const before = app.changes.before(name);
+    if (before && mode === "labels") return [{ mesh: new Mesh(before, app.up), caption: name, note: "before the last change" }];
+    if (mode === "labels" || mode === "history" || mode === "correct" || mode === "ask") {
       const info = app.shape(name);
       const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
       if (!fine && mode === "correct")
         throw new Error(`With ${info.n_polygons} faces this shape is corrected with “coseg correct”.`);
+      if (!fine && mode === "ask")
+        throw new Error(`With ${info.n_polygons} faces this shape is asked about with “coseg ask --png FILE”.`);
       if (!fine) return [{ mesh: proxy, caption: name, note: this.resolution(portrait, info) }];
       // The proxy at once, the mesh that was sent as soon as it is there.
       if (!this.scenes?.some((s) => s.mesh.portrait.name === name)) this.present([{ mesh: proxy, caption: name }]);
@@ -217,7 +221,7 @@ class Stage {
   /** Label of each face as painted so far. */
   paintedLabels(mesh) {
     if (this.painted.size === 0 || !mesh.polygons) return mesh.labels;
-    return mesh.labels.map((label, f) => this.painted.get(mesh.polygons[f]) ?? label);
+    return mesh.labels.map((label, f) => this.painted.labels.get(mesh.polygons[f]) ?? label);
   }
 
   colour() {
@@ -230,7 +234,7 @@ class Stage {
       }
       const labels = this.paintedLabels(mesh);
       const dim = (c) => c.map((x) => 0.2 * x + 0.8 * 178);
-      const lit = this.highlighted(mesh, highlight);
+      const lit = this.asked(mesh) ?? this.highlighted(mesh, highlight);
       const of = (f) => {
         const c = app.shownColour(labels[f]);
         return !lit || lit(f) ? c : dim(c);
@@ -238,6 +242,13 @@ class Stage {
       renderer.update(uploaded, "colour", faceColours(mesh.nFaces, of));
       renderer.update(uploaded, "border", mesh.borders(labels));
     }
+  }
+
+  /** Which faces of a mesh a person is asked about. */
+  asked(mesh) {
+    const { asker } = this.app;
+    if (this.mode !== "ask" || !mesh.polygons || !asker.asks(this.name)) return null;
+    return (f) => asker.question.faces.has(mesh.polygons[f]);
   }
 
   /** Which faces of a mesh a highlighted part or label covers. */
@@ -308,11 +319,14 @@ class Stage {
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       const shift = event.shiftKey || event.button === 2;
+      if (this.mode === "correct") this.painted.begin();
       const paint = this.mode === "correct" && !shift && !event.altKey && this.paint(event);
       drag = { x: event.clientX, y: event.clientY, shift, paint };
+      if (!paint) this.painted.open = null;
       if (!paint) canvas.classList.add("turning");
     });
     canvas.addEventListener("pointermove", (event) => {
+      this.moveCursor(event);
       if (!drag) return this.hover(event);
       if (drag.paint) return void this.paint(event);
       const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
@@ -328,12 +342,14 @@ class Stage {
       this.draw();
     });
     const end = () => {
+      if (drag?.paint) this.painted.end();
       drag = null;
+      this.app.panel.paintedChanged();
       canvas.classList.remove("turning");
     };
     canvas.addEventListener("pointerup", end);
     canvas.addEventListener("pointercancel", end);
-    canvas.addEventListener("pointerleave", () => ($("hint").hidden = true));
+    canvas.addEventListener("pointerleave", () => ($("hint").hidden = $("cursor").hidden = true));
     canvas.addEventListener("dblclick", () => {
       if (this.mode === "correct" || !this.scenes?.length) return;
       this.fit();
@@ -375,6 +391,24 @@ class Stage {
     this.draw();
   }
 
+  /** Shows how large the brush is where the pointer is. */
+  moveCursor(event) {
+    const cursor = $("cursor");
+    const shown = this.mode === "correct" && this.brush.tool !== "part" && this.pick(event);
+    cursor.hidden = !shown;
+    if (!shown) return;
+    const box = this.canvas.getBoundingClientRect();
+    // As View.scale has it.
+    const pixels = 0.9 * this.reach() * this.view.zoom * Math.min(box.width, box.height);
+    Object.assign(cursor.style, { left: `${event.clientX - box.left}px`, top: `${event.clientY - box.top}px`,
+      width: `${pixels}px`, height: `${pixels}px` });
+  }
+
+  /** Radius of the brush in units of the shape. */
+  reach() {
+    return this.brush.size / Math.max(this.view.zoom, 0.5);
+  }
+
   hover(event) {
     const hint = $("hint");
     const shown = this.scenes?.[0]?.mesh;
@@ -406,11 +440,11 @@ class Stage {
       const label = labels[found.face];
       faces = mesh.flood(found.face, (f) => labels[f] === label);
     } else {
-      const reach = brush.size / Math.max(this.view.zoom, 0.5);
+      const reach = this.reach();
       const near = (f) => Math.hypot(...mesh.centre(f).map((x, i) => x - found.point[i])) < reach;
       faces = mesh.flood(found.face, near);
     }
-    for (const f of faces) this.painted.set(mesh.polygons[f], brush.label);
+    for (const f of faces) this.painted.paint(mesh.polygons[f], brush.tool === "eraser" ? null : brush.label);
     this.colour();
     this.draw();
     this.app.panel.paintedChanged();
@@ -422,7 +456,9 @@ class Stage {
     const mesh = this.scenes?.[0]?.mesh;
     if (!mesh?.polygons || this.brush.label === null) return;
     const covers = this.highlighted(mesh, highlight);
-    for (let f = 0; f < mesh.nFaces; f++) if (covers(f)) this.painted.set(mesh.polygons[f], this.brush.label);
+    this.painted.begin();
+    for (let f = 0; f < mesh.nFaces; f++) if (covers(f)) this.painted.paint(mesh.polygons[f], this.brush.label);
+    this.painted.end();
     this.colour();
     this.draw();
     this.app.panel.paintedChanged();
@@ -430,6 +466,17 @@ class Stage {
 
   discard() {
     this.painted.clear();
+    this.repaint();
+  }
+
+  /** Takes a stroke back, or does it again; false if there is none. */
+  stroke(redo) {
+    const moved = redo ? this.painted.redo() : this.painted.undo();
+    if (moved) this.repaint();
+    return moved;
+  }
+
+  repaint() {
     this.colour();
     this.draw();
     this.app.panel.paintedChanged();
@@ -438,8 +485,9 @@ class Stage {
   /** Runs of polygons with the same painted label: first, count, label. */
   runs() {
     const runs = [];
-    for (const polygon of [...this.painted.keys()].sort((a, b) => a - b)) {
-      const label = this.painted.get(polygon);
+    const { labels } = this.painted;
+    for (const polygon of [...labels.keys()].sort((a, b) => a - b)) {
+      const label = labels.get(polygon);
       const last = runs.at(-1);
       if (last && last[0] + last[1] === polygon && last[2] === label) last[1]++;
       else runs.push([polygon, 1, label]);

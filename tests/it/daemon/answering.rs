@@ -61,6 +61,7 @@ fn correction(shape: &str) -> Body {
         collection: c(),
         shape: shape.to_owned(),
         correction: Some(Correction::Part(part)),
+        by: String::new(),
     })
 }
 

@@ -61,6 +61,7 @@ fn correct_request(shape: &str, labels: &[i32]) -> (wire::CorrectLabelsRequest, 
         collection: "c".to_owned(),
         shape: shape.to_owned(),
         correction: Some(Correction::Labels(labels)),
+        by: String::new(),
     };
     (request, frames)
 }

@@ -90,6 +90,7 @@ fn round(daemon: &Daemon, client: &mut Client, n: u64) {
                     collection: w(),
                     shape: "x".to_owned(),
                     correction,
+                    by: String::new(),
                 };
                 call!(client, CorrectLabels(request)).unwrap();
             }

@@ -167,6 +167,7 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             collection: c(),
             shape: "a".to_owned(),
             correction: Some(wire::correct_labels_request::Correction::Part(part)),
+            by: String::new(),
         }),
         // Behind the correction, waiting for the collection.
         Body::Undo(wire::UndoRequest { collection: c() }),

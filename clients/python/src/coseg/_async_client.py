@@ -385,10 +385,15 @@ class AsyncCollection:
 
     # -- shapes ---------------------------------------------------------------------------------
 
-    async def shapes(self, *, label: int | str | None = None) -> AsyncIterator[t.Shape]:
-        """All shapes in the order of their arrival, or those that carry a label, by its id or name."""
+    async def shapes(
+        self, *, label: int | str | None = None, review: str | None = None
+    ) -> AsyncIterator[t.Shape]:
+        """All shapes in the order of their arrival, or those that carry a label, by its id or name, or
+        those with a verdict, such as ``"approved"``."""
         token = ""
         fields: dict[str, Any] = {} if label is None else {"label": await self._label(label)}
+        if review is not None:
+            fields["review"] = wire.review_state(review)
         while True:
             reply, _ = await self._call("list_shapes", page_token=token, **fields)
             for shape in reply.shapes:
@@ -597,6 +602,51 @@ class AsyncCollection:
         """Takes back the newest correction, name, merge, split or change of the up axis."""
         reply, _ = await self._call("undo")
         return wire.flat(t.Undone, reply)
+
+    async def ask(self, *, passed: bool = False) -> t.Question | None:
+        """The part whose label is worth most to ask a person for, or ``None`` if there is none; with
+        ``passed`` also among those that were passed over."""
+        try:
+            reply, raw = await self._call("next_question", passed=passed)
+        except Refused as e:
+            if e.reason == "NOTHING_TO_ASK":
+                return None
+            raise
+        return wire.question(reply, raw)
+
+    async def answer(
+        self,
+        name: str,
+        part: int,
+        label: int | str | None = None,
+        *,
+        new: str | None = None,
+        skip: bool = False,
+        cut_wrongly: bool = False,
+        by: str = "",
+    ) -> t.Answered:
+        """Answers a question: the part has a ``label`` (id or name), or one of the ``new`` name, or it
+        is passed over, because it is skipped or cut wrongly."""
+        given: dict[str, Any] = {}
+        if label is not None:
+            given["label"] = await self._label(label)
+        if new is not None:
+            given["named"] = new
+        if skip:
+            given["skip"] = True
+        if cut_wrongly:
+            given["cut_wrongly"] = True
+        if len(given) != 1:
+            raise ValueError("give one of label, new, skip and cut_wrongly")
+        reply, _ = await self._call("answer_question", shape=name, part=part, by=by, **given)
+        return wire.answered(reply)
+
+    async def approve(self, name: str, *, doubtful: bool = False, by: str = "") -> t.Corrected | None:
+        """Takes all present labels of a shape as a person's; ``doubtful`` only notes that something is
+        wrong with them."""
+        state = wire.review_state("doubtful" if doubtful else "approved")
+        reply, _ = await self._call("review_shape", shape=name, state=state, by=by)
+        return wire.flat(t.Corrected, reply.corrected) if reply.HasField("corrected") else None
 
     async def suggest(self) -> t.Suggestion | None:
         """The shape whose labelling by a person would help most, or ``None`` if there is none."""

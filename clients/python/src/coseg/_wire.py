@@ -26,6 +26,8 @@ from coseg.v1 import (
     job_pb2,
     message_pb2,
     portrait_pb2,
+    question_pb2,
+    review_pb2,
     shape_pb2,
 )
 
@@ -226,6 +228,27 @@ def changed_label(reply: correction_pb2.MergeLabelsReply | correction_pb2.SplitL
     return t.ChangedLabel(**vars(label(reply.label)), n_changed=reply.n_shapes)
 
 
+def review_state(name: str) -> int:
+    """A verdict by its name."""
+    return _value(review_pb2.ReviewState, f"REVIEW_STATE_{name.upper()}", f"review is {name!r}")
+
+
+def question(reply: question_pb2.NextQuestionReply, raw: Raw) -> t.Question:
+    """The part to ask a person about."""
+    return flat(
+        t.Question,
+        reply,
+        faces=raw.array(reply.faces),
+        likeliest=tuple(flat(t.OfferedLabel, l) for l in reply.likeliest),
+    )
+
+
+def answered(reply: question_pb2.AnswerQuestionReply) -> t.Answered:
+    """What an answer did."""
+    corrected = flat(t.Corrected, reply.corrected) if reply.HasField("corrected") else None
+    return t.Answered(reply.label if reply.HasField("label") else None, corrected)
+
+
 def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
     """A collection."""
     spec = message.spec
@@ -283,6 +306,11 @@ def shape(message: shape_pb2.Shape) -> t.Shape:
         report=plain(message.report),
         parts=tuple(flat(t.Part, p) for p in message.parts),
         sources=tuple(flat(t.Source, s) for s in message.sources),
+        review=t.Review(
+            enum_name(review_pb2.ReviewState, "REVIEW_STATE_", message.review.state),
+            by=message.review.by,
+            unix_ms=message.review.unix_ms,
+        ),
     )
 
 

@@ -136,6 +136,18 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Review:
+    """A person's verdict on the labels of a shape: ``"unseen"``, ``"corrected"``, ``"approved"`` or
+    ``"doubtful"``."""
+
+    state: str
+    #: Who gave it; may be empty.
+    by: str
+    #: When, in milliseconds since 1970; 0: unknown.
+    unix_ms: int
+
+
+@dataclass(frozen=True)
 class Shape:
     """A shape as it stands."""
 
@@ -156,6 +168,7 @@ class Shape:
     report: Mapping[str, object]
     parts: tuple[Part, ...]
     sources: tuple[Source, ...]
+    review: Review
 
 
 @dataclass(frozen=True)
@@ -435,12 +448,56 @@ class Corrected:
 
 @dataclass(frozen=True)
 class Undone:
-    """What was undone: ``"correct"``, ``"name"``, ``"merge"``, ``"split"`` or ``"up"``."""
+    """What was undone: ``"correct"``, ``"answer"``, ``"approve"``, ``"doubt"``, ``"name"``,
+    ``"merge"``, ``"split"`` or ``"up"``."""
 
     change: str
+    #: What it changed: a shape, a label or an axis.
+    subject: str
     #: Changes that can still be undone.
     n_left: int
     sequence: int
+
+
+@dataclass(frozen=True)
+class OfferedLabel:
+    """A label that may be the answer to a question."""
+
+    label: int
+    #: Empty if it has none.
+    name: str
+    probability: float
+    #: Whether a person has used it; if not, it was discovered.
+    used: bool
+
+
+@dataclass(frozen=True)
+class Question:
+    """The part whose label is worth most to ask a person for."""
+
+    shape: str
+    #: Its number among the parts into which questions divide the shape.
+    part: int
+    #: (n,) its polygons.
+    faces: UInt32
+    #: Its share of the shape's area.
+    area_share: float
+    #: Probability that its likeliest label is wrong.
+    doubt: float
+    #: Area that the answer is expected to decide, in shapes.
+    gain: float
+    likeliest: tuple[OfferedLabel, ...]
+    #: Parts in which a person has labelled something.
+    n_answered: int
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What an answer did."""
+
+    #: The label that the part has now, if it has one by the answer.
+    label: int | None
+    corrected: Corrected | None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,205 @@
+//! A person's verdict on a shape: its labels were corrected, are right as they are, or are doubtful.
+
+use super::change::{Change, Undoable, commit_once};
+use super::correct::{Corrected, Correction, corrects};
+use super::error::Result;
+use super::facade::Library;
+use super::names::check_name;
+use super::once::{Request, answered, from_reply, unix_ms};
+use super::rows::{damaged, to_json};
+use super::sources::Sources;
+use super::types::RequestKey;
+use crate::store::ReviewRow;
+use serde::{Deserialize, Serialize};
+
+/// Most bytes of a person's name.
+const MAX_REVIEWER: usize = 128;
+
+/// A person's verdict on the labels of a shape.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ReviewState {
+    /// Nobody has given a verdict.
+    Unseen,
+    /// A person labelled some of its faces.
+    Corrected,
+    /// A person found all its labels right.
+    Approved,
+    /// A person found something wrong that is still there.
+    Doubtful,
+}
+
+impl ReviewState {
+    /// All of them, in the order in which work proceeds.
+    pub const ALL: [Self; 4] = [
+        Self::Unseen,
+        Self::Corrected,
+        Self::Approved,
+        Self::Doubtful,
+    ];
+
+    /// The stored name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unseen => "unseen",
+            Self::Corrected => "corrected",
+            Self::Approved => "approved",
+            Self::Doubtful => "doubtful",
+        }
+    }
+
+    /// The state of this name.
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|s| s.name() == name)
+    }
+}
+
+/// A verdict with who gave it and when.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Review {
+    /// The verdict.
+    pub state: ReviewState,
+    /// Who gave it, as the person said; may be empty.
+    pub by: String,
+    /// When, in milliseconds since 1970; 0: unknown.
+    pub unix_ms: u64,
+}
+
+impl Review {
+    /// The review that a row says, or its absence: before reviews were stored, pins alone said that
+    /// a shape was corrected.
+    pub(super) fn of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Self> {
+        let Some(row) = row else {
+            return Ok(Self {
+                state: match pinned {
+                    true => ReviewState::Corrected,
+                    false => ReviewState::Unseen,
+                },
+                by: String::new(),
+                unix_ms: 0,
+            });
+        };
+        let state = ReviewState::of_name(&row.state);
+        let unknown = || damaged("reviews", &format!("{:?} is not a state", row.state));
+        Ok(Self {
+            state: state.ok_or_else(unknown)?,
+            by: row.reviewer,
+            unix_ms: row.unix_ms,
+        })
+    }
+}
+
+/// Refuses what cannot be a person's name. It may be empty.
+pub(super) fn check_reviewer(by: &str) -> Result<()> {
+    match by {
+        "" => Ok(()),
+        by => check_name("person", by, MAX_REVIEWER),
+    }
+}
+
+/// A verdict that is given now.
+pub(super) fn review_row(state: ReviewState, by: &str) -> ReviewRow {
+    ReviewRow {
+        state: state.name().to_owned(),
+        reviewer: by.to_owned(),
+        unix_ms: unix_ms(),
+    }
+}
+
+impl Library {
+    /// Takes all present labels of a shape as a person's, who found them right: it becomes a
+    /// training shape, from which the labels of other shapes follow in the background.
+    ///
+    /// # Errors
+    /// There is no such collection or shape, or its labels are too many for a person's.
+    pub fn approve(
+        &self,
+        collection: &str,
+        shape: &str,
+        by: &str,
+        key: Option<&RequestKey>,
+    ) -> Result<Corrected> {
+        check_reviewer(by)?;
+        let request = Request::of(key, &format!("approve {collection:?} {shape:?}"));
+        let row = self.collection_row(collection)?;
+        self.with_collection(row, |in_memory| {
+            if let Some(reply) = answered(&self.store, &request)? {
+                return from_reply(&reply);
+            }
+            let id = self.shape_row(collection, shape)?.1.id;
+            let labels = self.store.known(id)?.labels.polygon_labels;
+            let mut corrects = corrects(in_memory, &self.store, id, &Correction::Whole(labels))?;
+            corrects.change.undoable = Some(Undoable::Approve {
+                shape: shape.to_owned(),
+            });
+            let review = review_row(ReviewState::Approved, by);
+            corrects.change.reviews.push((id, Some(review)));
+            let reply = corrects.commit(&self.store, in_memory, &request, |done| to_json(&done))?;
+            from_reply(&reply)
+        })
+    }
+
+    /// Notes that a person found something wrong with the labels of a shape, and left it. No label
+    /// changes.
+    ///
+    /// # Errors
+    /// There is no such collection or shape.
+    pub fn doubt(
+        &self,
+        collection: &str,
+        shape: &str,
+        by: &str,
+        key: Option<&RequestKey>,
+    ) -> Result<Review> {
+        check_reviewer(by)?;
+        let request = Request::of(key, &format!("doubt {collection:?} {shape:?}"));
+        let row = self.collection_row(collection)?;
+        self.with_collection(row, |in_memory| {
+            let id = self.shape_row(collection, shape)?.1.id;
+            if answered(&self.store, &request)?.is_none() {
+                let change = Change {
+                    undoable: Some(Undoable::Doubt {
+                        shape: shape.to_owned(),
+                    }),
+                    reviews: vec![(id, Some(review_row(ReviewState::Doubtful, by)))],
+                    ..Change::default()
+                };
+                commit_once(&self.store, in_memory, change, &request, |_, _| {
+                    Ok(Vec::from(b"doubtful"))
+                })?;
+            }
+            let found = self.store.catalog().read(|r| r.review(id))?;
+            Review::of_row(found, false)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn states_have_names_that_come_back() {
+        for state in ReviewState::ALL {
+            assert_eq!(ReviewState::of_name(state.name()), Some(state));
+        }
+        assert_eq!(ReviewState::of_name("sure"), None);
+    }
+
+    #[test]
+    fn shapes_that_an_earlier_version_corrected_count_as_corrected() {
+        let state = |row, pinned| Review::of_row(row, pinned).map(|r| r.state);
+        assert_eq!(state(None, false).unwrap(), ReviewState::Unseen);
+        assert_eq!(state(None, true).unwrap(), ReviewState::Corrected);
+        let row = review_row(ReviewState::Approved, "ada");
+        assert_eq!(
+            state(Some(row.clone()), true).unwrap(),
+            ReviewState::Approved
+        );
+        let row = ReviewRow {
+            state: "sure".into(),
+            ..row
+        };
+        assert!(state(Some(row), true).is_err());
+    }
+}

@@ -1,0 +1,94 @@
+// Questions to a person: one part at a time, one key an answer.
+
+/** Keys of the likeliest labels. */
+const ANSWER_KEYS = ["1", "2", "3"];
+
+class Asker {
+  constructor(app) {
+    this.app = app;
+    this.question = null;
+  }
+
+  /** Whether the shape is the one that is asked about. */
+  asks(shape) {
+    return this.question?.shape === shape;
+  }
+
+  /** Fetches the next question and goes to its shape. */
+  async next() {
+    const { app } = this;
+    const question = await app.source.question(app.name);
+    this.question = { ...question, faces: new Set(question.faces) };
+    if (app.selected === question.shape && app.stage.mode === "ask") {
+      app.stage.colour();
+      app.stage.draw();
+      app.panel.showControls();
+      return;
+    }
+    await app.go({ shape: question.shape, view: "ask", detail: null });
+  }
+
+  /** Sends an answer and asks on: `{label}`, `{named}`, `{skip}` or `{cut_wrongly}`. */
+  answer(answer) {
+    const { app, question } = this;
+    if (!question || this.busy) return;
+    this.busy = true;
+    return app.attempt(async () => {
+      try {
+        const body = { collection: app.name, shape: question.shape, part: question.part, ...answer };
+        if (answer.skip || answer.cut_wrongly) await app.source.change("answer", body);
+        else await app.changes.send("answer", body);
+        await this.next();
+        await app.reload();
+      } finally {
+        this.busy = false;
+      }
+    });
+  }
+
+  controls(box) {
+    const { app, question } = this;
+    if (!question || !this.asks(app.selected)) {
+      const ask = make("button", { className: "primary", id: "ask-here" }, "Ask the next question");
+      ask.onclick = () => app.attempt(() => this.next());
+      return box.replaceChildren(ask, make("span", { className: "quiet" }, "the part whose label is worth most comes first"));
+    }
+    const buttons = question.likeliest.map((offered, i) => {
+      const button = make("button", { "data-answer": i + 1, title: `${percent(offered.probability)} probable` },
+        make("kbd", {}, ANSWER_KEYS[i]), swatch(app.colour(offered.label)), app.labelName(offered.label));
+      button.onclick = () => this.answer({ label: offered.label });
+      return button;
+    });
+    const name = make("input", { placeholder: "another label, or a new one", maxLength: 128, "aria-label": "Name of the label", id: "ask-name" });
+    name.setAttribute("list", "ask-names");
+    const names = make("datalist", { id: "ask-names" },
+      ...app.labelsInUse().filter((l) => l.name).map((l) => make("option", { value: l.name })));
+    name.onkeydown = (event) => {
+      event.stopPropagation();
+      if (event.key === "Escape") name.blur();
+      if (event.key !== "Enter" || !name.value.trim()) return;
+      event.preventDefault();
+      name.blur();
+      this.answer({ named: name.value.trim() });
+    };
+    const skip = make("button", { id: "ask-skip" }, make("kbd", {}, "s"), "Skip");
+    skip.onclick = () => this.answer({ skip: true });
+    const cut = make("button", { id: "ask-cut" }, make("kbd", {}, "x"), "Cut wrongly");
+    cut.onclick = () => this.answer({ cut_wrongly: true });
+    box.replaceChildren(
+      make("span", {}, `Which label has the bright part? (${question.n_answered} answered)`),
+      make("div", { className: "palette" }, ...buttons), make("label", {}, make("kbd", {}, "n"), name), names, skip, cut);
+  }
+
+  /** Takes a key; true if it meant something. */
+  key(key) {
+    if (!this.asks(this.app.selected)) return false;
+    const offered = this.question.likeliest[ANSWER_KEYS.indexOf(key)];
+    if (offered) this.answer({ label: offered.label });
+    else if (key === "n") $("ask-name")?.focus();
+    else if (key === "s") this.answer({ skip: true });
+    else if (key === "x") this.answer({ cut_wrongly: true });
+    else return false;
+    return true;
+  }
+}

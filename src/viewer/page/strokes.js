@@ -1,0 +1,62 @@
+// What is painted on a shape, stroke by stroke: each can be undone and redone until it is sent.
+
+class Strokes {
+  constructor() {
+    this.clear();
+  }
+
+  clear() {
+    this.done = [];
+    this.undone = [];
+    /** Painted label of each polygon. */
+    this.labels = new Map();
+    this.open = null;
+  }
+
+  get size() {
+    return this.labels.size;
+  }
+
+  begin() {
+    this.open = { before: new Map() };
+  }
+
+  /** Paints a polygon within the stroke; null takes away what is painted. */
+  paint(polygon, label) {
+    const { open, labels } = this;
+    if (!open.before.has(polygon)) open.before.set(polygon, labels.get(polygon));
+    if (label === null) labels.delete(polygon);
+    else labels.set(polygon, label);
+  }
+
+  end() {
+    const { open } = this;
+    this.open = null;
+    if (!open?.before.size) return;
+    this.done.push(open);
+    this.undone = [];
+  }
+
+  /** Takes the newest stroke back, or does the newest one again that was; false if there is none. */
+  step(from, to) {
+    this.end();
+    const stroke = from.pop();
+    if (!stroke) return false;
+    const now = new Map();
+    for (const [polygon, label] of stroke.before) {
+      now.set(polygon, this.labels.get(polygon));
+      if (label === undefined) this.labels.delete(polygon);
+      else this.labels.set(polygon, label);
+    }
+    to.push({ before: now });
+    return true;
+  }
+
+  undo() {
+    return this.step(this.done, this.undone);
+  }
+
+  redo() {
+    return this.step(this.undone, this.done);
+  }
+}
