@@ -87,6 +87,9 @@ step "Python: style, types, tests"
         --pyi_out="$clean/src" "$ROOT"/proto/coseg/v1/*.proto
     touch "$clean/src/coseg/v1/__init__.py"
     (cd "$clean" && mypy --no-error-summary)
+    # What a caller sees, from outside: the stub against the module, and strict programs.
+    python -m mypy.stubtest coseg._native
+    (cd "$WORK/stranger" && cp "$clean/tests/typed.py" . && mypy --strict typed.py && pyright --level error typed.py)
     # Against the installed wheel: what is tested is what a stranger gets.
     python -m pytest --durations=3
 )

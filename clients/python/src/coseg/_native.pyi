@@ -1,10 +1,40 @@
 """The geometry of coseg, compiled. Arrays are C-contiguous and of exactly these types."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
+
+__all__ = [
+    "Shape",
+    "__version__",
+    "clean",
+    "describe",
+    "edge_distances",
+    "faces_in_sight",
+    "faces_to_faces",
+    "fit",
+    "functional",
+    "hks_times",
+    "icp",
+    "labels_to_faces",
+    "landmark_probes",
+    "laplacian",
+    "null_space",
+    "parse",
+    "point_kernels",
+    "point_map_back",
+    "point_maps",
+    "pointwise",
+    "precise",
+    "segment",
+    "signature_probes",
+    "spectrum",
+    "topology",
+    "triangulate",
+    "zoomout",
+]
 
 __version__: str
 
@@ -16,6 +46,7 @@ _I32 = NDArray[np.int32]
 _Bool = NDArray[np.bool_]
 _Progress = Callable[[str, int, int], None] | None
 
+@final
 class Shape:
     def __new__(
         cls, vertices: _F64, faces: _U32, eigenvalues: _F64, eigenvectors: _F64, mass: _F64
