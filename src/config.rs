@@ -402,9 +402,14 @@ impl Limits {
         self.memory.0 / 8 / CONNECTION
     }
 
-    /// Bytes set aside for shapes being described.
+    /// Bytes set aside for shapes being described and for prepared ones.
     pub fn describe_bytes(&self) -> u64 {
         self.memory.0 / 2
+    }
+
+    /// Bytes set aside for prepared shapes that the placing workers keep between pieces of work.
+    pub fn prepared_bytes(&self) -> u64 {
+        self.memory.0 / 8
     }
 
     /// Bytes set aside for what HTTP has in hand: a share, and the largest answer at least.
