@@ -2,7 +2,9 @@
 //! to run only those whose names contain it. One thread, except where a stage uses rayon's pool
 //! itself; the shapes are generated here.
 
+use coseg::Library;
 use coseg::labels::{DiscoveryOptions, LabelModel};
+use coseg::library::{CollectionSpec, Correction, MAX_BATCH, NewShape};
 use coseg::mesh::{Format, write};
 use coseg::pipeline::{
     Description, Params, Prepared, ReclusterOptions, Reclustering, Representative, Vote, describe,
@@ -135,4 +137,43 @@ fn recluster_eight(bencher: Bencher<'_, '_>) {
         .map(|(s, l)| representative(s, l))
         .collect();
     bencher.bench_local(|| recluster(&shapes, Some(collection.model()), 1, &options(100)));
+}
+
+/// A correction of one of 60 chairs, and its propagation to the others, at 200 working faces: the
+/// model is fitted to 40 of them, and the rest are relabelled, so many at a time.
+#[divan::bench(args = [1, MAX_BATCH], sample_count = 5, sample_size = 1)]
+fn propagate_a_correction(bencher: Bencher<'_, '_>, batch: usize) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let library = Library::open(folder.path()).expect("a library");
+    let spec = CollectionSpec {
+        name: "chairs".to_owned(),
+        n_parts: Some(N_LABELS as u32),
+        working_faces: 200,
+        ..CollectionSpec::default()
+    };
+    library.create_collection(&spec, None).expect("created");
+    let options = Options {
+        n_faces: 1_000,
+        ..Options::default()
+    };
+    let made = family(Family::Chair, 7, 60, &options);
+    for shape in &made {
+        let file = NewShape {
+            name: shape.name.clone(),
+            bytes: write::off(&shape.mesh).into_bytes(),
+            format: Format::Off,
+            replace: false,
+        };
+        library.add("chairs", file).expect("added");
+    }
+    let truth = Correction::Whole(made[0].labels.iter().map(|l| *l as i32).collect());
+    bencher.bench_local(|| {
+        let corrected = library.correct("chairs", &made[0].name, &truth, None);
+        corrected.expect("corrected");
+        while library
+            .relabel_batch(Some("chairs"), batch)
+            .expect("relabelled")
+            > 0
+        {}
+    });
 }

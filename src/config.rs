@@ -403,9 +403,14 @@ impl Limits {
         self.memory.0 / 8 / CONNECTION
     }
 
-    /// Bytes reserved for shapes that are being described.
+    /// Bytes reserved for shapes that are being described and for prepared ones.
     pub fn describe_bytes(&self) -> u64 {
         self.memory.0 / 2
+    }
+
+    /// Bytes reserved for prepared shapes that the placing workers keep between pieces of work.
+    pub fn prepared_bytes(&self) -> u64 {
+        self.memory.0 / 8
     }
 
     /// Bytes reserved for the work of HTTP: a share, and at least the largest answer.

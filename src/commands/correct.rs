@@ -9,6 +9,7 @@ use coseg::ipc::frames::FrameWriter;
 use coseg::ipc::wire::{self, correct_labels_request::Correction};
 use coseg::text::counted;
 use serde_json::json;
+use std::time::Instant;
 
 pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
     let collection = session.collection(&args.within)?;
@@ -46,9 +47,14 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
         by: args.person.name(),
     };
     let frames: Vec<Bytes> = frames.finish();
+    let begin = Instant::now();
+    let elapsed_ms = || begin.elapsed().as_secs_f64() * 1e3;
     let done = call!(session.client, CorrectLabels(request), frames, with_frames)?.0;
+    let first_ms = elapsed_ms();
+    let mut all_ms = None;
     if !args.no_wait {
         session.wait_until_idle(&collection)?;
+        all_ms = Some(elapsed_ms());
     }
     if session.json {
         session.print_json(&json!({
@@ -60,6 +66,8 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
             "changed_share": done.changed_share,
             "n_shapes": done.n_stale,
             "job_id": done.job_id,
+            "first_ms": first_ms,
+            "all_ms": all_ms,
         }))?;
     } else {
         let propagated = if args.no_wait {

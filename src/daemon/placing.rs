@@ -10,7 +10,9 @@ use crate::daemon::failures::{cancelled, died_each_time, failed, panicked, too_l
 use crate::daemon::shared::{Daemon, Notice, blocking};
 use crate::daemon::work::{Outcome, Prepared, Step};
 use crate::daemon::worker::{self, Ended, Placing};
-use crate::library::{Code, Described, Failure, ItemState, JobItem, LibraryError, Reason};
+use crate::library::{
+    Code, Described, Failure, ItemState, JobItem, LibraryError, MAX_BATCH, Reason,
+};
 use crate::store::StoreError;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -21,6 +23,35 @@ use tokio::sync::{mpsc, oneshot};
 const FIRST_RETRY: Duration = Duration::from_secs(1);
 const LAST_RETRY: Duration = Duration::from_secs(30);
 
+/// Workers that ended while they relabelled shapes of a collection.
+#[derive(Default)]
+struct Deaths {
+    /// In a row.
+    n: u32,
+    /// Shapes to relabel one by one, to find the one that ended the last.
+    n_single: usize,
+}
+
+impl Deaths {
+    /// Most shapes to relabel next.
+    fn batch(&self) -> usize {
+        match self.n_single {
+            0 => MAX_BATCH,
+            _ => 1,
+        }
+    }
+
+    fn one(&mut self) {
+        self.n += 1;
+        self.n_single = MAX_BATCH;
+    }
+
+    fn none(&mut self) {
+        self.n = 0;
+        self.n_single = self.n_single.saturating_sub(1);
+    }
+}
+
 /// The placement queue of a collection.
 pub(crate) async fn place_in_order(
     daemon: Arc<Daemon>,
@@ -28,12 +59,12 @@ pub(crate) async fn place_in_order(
     mut steps: mpsc::UnboundedReceiver<Step>,
 ) {
     let mut relabel = true;
-    let mut n_deaths = 0;
+    let mut deaths = Deaths::default();
     loop {
         let step = match steps.try_recv() {
             Ok(step) => step,
             Err(mpsc::error::TryRecvError::Empty) if relabel => {
-                relabel = relabel_next(&daemon, &collection, &mut n_deaths).await;
+                relabel = relabel_next(&daemon, &collection, &mut deaths).await;
                 continue;
             }
             Err(_) => match steps.recv().await {
@@ -44,7 +75,7 @@ pub(crate) async fn place_in_order(
         let mut ready = match step {
             Step::Place(ready) => ready,
             Step::Relabel => {
-                (relabel, n_deaths) = (true, 0);
+                (relabel, deaths) = (true, Deaths::default());
                 continue;
             }
         };
@@ -52,7 +83,7 @@ pub(crate) async fn place_in_order(
             match ready.prepared.try_recv() {
                 Ok(prepared) => break Ok(prepared),
                 Err(oneshot::error::TryRecvError::Empty) if relabel => {
-                    relabel = relabel_next(&daemon, &collection, &mut n_deaths).await;
+                    relabel = relabel_next(&daemon, &collection, &mut deaths).await;
                 }
                 Err(_) => break (&mut ready.prepared).await,
             }
@@ -282,69 +313,72 @@ fn report(daemon: &Daemon, item: &JobItem, state: &ItemState) {
     }
 }
 
-/// Relabels one stale shape of the collection. Returns false if none was stale, or none can be
-/// relabelled now. A shape that ends its worker too often is not tried again before a change.
-async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, n_deaths: &mut u32) -> bool {
-    if daemon.is_draining() || *n_deaths >= MAX_ATTEMPTS {
+/// Relabels a batch of stale shapes of the collection. Returns false if none was stale, or none can
+/// be relabelled now. A shape that ends its worker too often is not tried again before a change.
+async fn relabel_next(daemon: &Arc<Daemon>, collection: &str, deaths: &mut Deaths) -> bool {
+    if daemon.is_draining() || deaths.n >= MAX_ATTEMPTS {
         return false;
     }
+    let most = deaths.batch();
     let permit = Arc::clone(&daemon.capacity.placing).acquire_owned().await;
     let name = collection.to_owned();
-    let relabelled = blocking(daemon, move |d| relabel_remotely(d, &name)).await;
+    let relabelled = blocking(daemon, move |d| relabel_remotely(d, &name, most)).await;
     drop(permit);
     let fault = |error: &str| {
         daemon.telemetry.metrics.fault("relabel");
         tracing::error!(collection, error, "a stale shape cannot be relabelled");
     };
-    let again = match relabelled {
-        Ok(Ok(Ok(again))) => {
-            *n_deaths = 0;
-            again
+    let n_shapes = match relabelled {
+        Ok(Ok(Ok(n_shapes))) => {
+            deaths.none();
+            n_shapes
         }
         Ok(Ok(Err(death))) => {
-            *n_deaths += 1;
+            deaths.one();
             daemon.telemetry.metrics.workers_died.inc();
             fault(&death);
-            return *n_deaths < MAX_ATTEMPTS;
+            return deaths.n < MAX_ATTEMPTS;
         }
-        Ok(Err(LibraryError::NotFound { .. })) => false,
+        Ok(Err(LibraryError::NotFound { .. })) => 0,
         Ok(Err(e)) => {
             fault(&e.to_string());
-            false
+            0
         }
         Err(panic) => {
             fault(&format!("it panicked: {panic}"));
-            false
+            0
         }
     };
+    let again = n_shapes > 0;
     if again {
-        daemon.telemetry.metrics.relabelled.inc();
+        daemon.telemetry.metrics.relabelled.inc_by(n_shapes);
         daemon.notice(Notice::Changed(collection.to_owned()));
     }
     daemon.work.changed();
     again
 }
 
-/// Whether a shape was relabelled. The inner error says what ended the worker.
+/// How many shapes were relabelled, at most `most`. The inner error says what ended the worker.
 fn relabel_remotely(
     daemon: &Arc<Daemon>,
     collection: &str,
-) -> Result<Result<bool, String>, LibraryError> {
+    most: usize,
+) -> Result<Result<u64, String>, LibraryError> {
     let library = &daemon.library;
     // Most often there is nothing to do, which shows without a worker.
     if !library.has_stale(collection)? {
-        return Ok(Ok(false));
+        return Ok(Ok(0));
     }
     library.store().health().writable()?;
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let wanted = || begin.elapsed() < limit;
-    let work = Placing::Relabel(collection);
+    let work = Placing::Relabel(collection, most);
     let report =
         library.with_exclusive(collection, || daemon.pool.place(collection, work, &wanted))?;
     match report {
         Ok(report) => match outcome(daemon, &report)? {
-            worker::Outcome::Relabelled(again) => Ok(Ok(again)),
+            worker::Outcome::Relabelled(n_shapes) => Ok(Ok(n_shapes)),
             worker::Outcome::Failed(why) => Ok(Err(why.message)),
             worker::Outcome::State(state) => Ok(Err(format!("a worker reported {state:?}"))),
         },

@@ -182,7 +182,7 @@ impl Daemon {
         self.admission.replies.set_limit(limits.reply_bytes());
         self.admission.quotas.set_limits(limits);
         let describing = &self.capacity.describe_memory;
-        describing.set_limit(limits.describe_bytes());
+        describing.set_limit(limits.describe_bytes() - limits.prepared_bytes());
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(config);
     }
 
@@ -226,10 +226,10 @@ impl Admission {
 
 impl Capacity {
     fn new(config: &Config) -> Self {
-        let n_workers = config.n_workers();
+        let (n_workers, limits) = (config.n_workers(), &config.limits);
         Self {
             n_workers,
-            describe_memory: Budget::new(config.limits.describe_bytes()),
+            describe_memory: Budget::new(limits.describe_bytes() - limits.prepared_bytes()),
             describing: Arc::new(Semaphore::new(n_workers)),
             placing: Arc::new(Semaphore::new(n_workers)),
             editing: Semaphore::new(n_workers),

@@ -51,7 +51,12 @@ pub fn start(config: Config) -> Result<Running, StartError> {
     let pages = http::bind(&config, &directory)?;
     let found = find(&library).map_err(opened)?;
     share(&library, &bound.endpoint).map_err(opened)?;
-    let pool = Pool::new(&directory, config.n_workers()).map_err(StartError::Worker)?;
+    let pool = Pool::new(
+        &directory,
+        config.n_workers(),
+        config.limits.prepared_bytes(),
+    )
+    .map_err(StartError::Worker)?;
 
     let (notices, notices_out) = mpsc::unbounded_channel();
     let (control_in, control) = std::sync::mpsc::channel();

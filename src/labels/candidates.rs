@@ -1,11 +1,11 @@
 //! Many ways to group the parts of a few shapes: the pool from which a labelling is chosen.
 
 use super::criterion::{CREASE_SCALE, Criterion};
-use super::discover::Prepared;
+use super::discover::{Prepared, PreparedShape};
 use super::joint::{Rows, combine, diffusion, embedding, inter_shape, row_normalised, symmetric};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::{PartGraph, merge_patches};
-use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
+use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 
@@ -42,8 +42,9 @@ pub(super) fn pool(
         (4 * k + 8, &[0.35, 0.5][..], 2),
     ];
     let sizes: Vec<usize> = granularities.iter().map(|g| g.0).collect();
-    let merged: Vec<Vec<Vec<u32>>> = shapes
-        .each()
+    let each: Vec<PreparedShape<'_>> = shapes.each().collect();
+    let merged: Vec<Vec<Vec<u32>>> = each
+        .par_iter()
         .map(|s| merge_patches(s.patches, s.patch_means, shapes.dim, &sizes))
         .collect();
     let mut found = Pool {
@@ -70,8 +71,13 @@ pub(super) fn pool(
             parts[g].groupings(&vectors, alphas, k..=k + extra, seed)
         })
         .collect();
-    for grouping in groupings.into_iter().flatten() {
-        found.add_merged(criterion, grouping.of_patch, grouping.n_labels);
+    let groupings: Vec<Grouping> = groupings.into_iter().flatten().collect();
+    let merged: Vec<Vec<Vec<u32>>> = groupings
+        .into_par_iter()
+        .map(|g| merged_to(k, criterion, g.of_patch, g.n_labels))
+        .collect();
+    for labels in merged.into_iter().flatten() {
+        found.add(labels);
     }
     found.labellings
 }
@@ -82,6 +88,36 @@ struct Grouping {
     of_patch: Vec<u32>,
 }
 
+/// What a labelling with `n_labels >= k` labels becomes when it is merged down to k by beam search.
+fn merged_to(k: usize, criterion: &Criterion, labels: Vec<u32>, n_labels: usize) -> Vec<Vec<u32>> {
+    let mut beam = vec![(criterion.pair_sums(&labels, n_labels), labels)];
+    for size in (k + 1..=n_labels).rev() {
+        let mut next = Vec::new();
+        for (at, (sums, _)) in beam.iter().enumerate() {
+            for a in 0..size {
+                for b in a + 1..size {
+                    let merged = sums.merged(a, b);
+                    next.push((criterion.score(&merged), at, a as u32, b as u32, merged));
+                }
+            }
+        }
+        next.sort_by(|x, y| y.0.total_cmp(&x.0));
+        next.truncate(if size - 1 > k { BEAM_WIDTH } else { BEAM_KEPT });
+        beam = next
+            .into_iter()
+            .map(|(_, at, a, b, sums)| {
+                let rename = |l: &u32| match *l {
+                    l if l == b => a,
+                    l if l > b => l - 1,
+                    l => l,
+                };
+                (sums, beam[at].1.iter().map(rename).collect())
+            })
+            .collect();
+    }
+    beam.into_iter().map(|(_, labels)| labels).collect()
+}
+
 struct Pool {
     k: usize,
     seen: BTreeSet<Vec<u32>>,
@@ -89,42 +125,6 @@ struct Pool {
 }
 
 impl Pool {
-    /// Takes a labelling with `n_labels >= k` labels, after merging it down to k by beam search.
-    fn add_merged(&mut self, criterion: &Criterion, labels: Vec<u32>, n_labels: usize) {
-        let mut beam = vec![(criterion.pair_sums(&labels, n_labels), labels)];
-        for size in (self.k + 1..=n_labels).rev() {
-            let mut next = Vec::new();
-            for (at, (sums, _)) in beam.iter().enumerate() {
-                for a in 0..size {
-                    for b in a + 1..size {
-                        let merged = sums.merged(a, b);
-                        next.push((criterion.score(&merged), at, a as u32, b as u32, merged));
-                    }
-                }
-            }
-            next.sort_by(|x, y| y.0.total_cmp(&x.0));
-            next.truncate(if size - 1 > self.k {
-                BEAM_WIDTH
-            } else {
-                BEAM_KEPT
-            });
-            beam = next
-                .into_iter()
-                .map(|(_, at, a, b, sums)| {
-                    let rename = |l: &u32| match *l {
-                        l if l == b => a,
-                        l if l > b => l - 1,
-                        l => l,
-                    };
-                    (sums, beam[at].1.iter().map(rename).collect())
-                })
-                .collect();
-        }
-        for (_, labels) in beam {
-            self.add(labels);
-        }
-    }
-
     /// Takes a labelling unless a label is empty or the same partition is there already.
     fn add(&mut self, mut labels: Vec<u32>) {
         let mut names = vec![u32::MAX; labels.iter().max().map_or(0, |m| *m as usize + 1)];

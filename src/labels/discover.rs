@@ -12,7 +12,7 @@ use super::judge::Judge;
 use super::patchwise::{Patchwise, in_metric};
 use super::{Features, Statistics};
 use crate::segmentation::{PatchGraph, Surface};
-use rayon::prelude::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
+use rayon::prelude::*;
 
 /// Labellings from which a metric is learnt.
 const N_TEACHERS: usize = 10;
@@ -236,8 +236,11 @@ fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOpt
         let judge = Judge::new(criterion, candidates, &shapes.area, k);
         judge.comparable_value()
     };
-    let values = (2..=options.max_labels.max(2)).map(|k| (k, value(k)));
-    let best = values.reduce(|best, next| if next.1 > best.1 { next } else { best });
+    let counts = (2..=options.max_labels.max(2)).into_par_iter();
+    let values: Vec<(usize, f64)> = counts.map(|k| (k, value(k))).collect();
+    let best = values
+        .into_iter()
+        .reduce(|best, next| if next.1 > best.1 { next } else { best });
     best.map_or(2, |(k, _)| k)
 }
 
@@ -312,20 +315,25 @@ fn refine(input: &DiscoveryInput<'_>, mut labels: Vec<Vec<u32>>, k: usize) -> Ve
     for _ in 0..REFINEMENTS {
         let dim = input.shapes[0].features.dim;
         let mut statistics = Statistics::empty(k, dim);
-        for (s, labels) in input.shapes.iter().zip(&labels) {
-            let of_shape =
-                Statistics::of_shape(s.features, &s.surface.area, |f| Some(labels[f]), k);
-            statistics.accumulate(&of_shape, 1.0);
+        let of_shapes: Vec<Statistics> = (input.shapes.par_iter().zip(&labels))
+            .map(|(s, labels)| {
+                Statistics::of_shape(s.features, &s.surface.area, |f| Some(labels[f]), k)
+            })
+            .collect();
+        // In the order of the shapes, so that sums are the same on any number of threads.
+        for of_shape in &of_shapes {
+            statistics.accumulate(of_shape, 1.0);
         }
         let classifier = statistics.classifier();
         let mut changed = 0.0;
-        for (s, labels) in input.shapes.iter().zip(&mut labels) {
-            let unary: Vec<f64> = classifier
-                .log_probabilities(s.features)
-                .into_iter()
-                .map(|p| (-p).min(CAP_NATS))
-                .collect();
-            let next = cut(s.surface, &unary, k, STRENGTH, None);
+        let cuts: Vec<Vec<u32>> = (input.shapes.par_iter())
+            .map(|s| {
+                let log = classifier.log_probabilities(s.features).into_iter();
+                let unary: Vec<f64> = log.map(|p| (-p).min(CAP_NATS)).collect();
+                cut(s.surface, &unary, k, STRENGTH, None)
+            })
+            .collect();
+        for ((s, labels), next) in input.shapes.iter().zip(&mut labels).zip(cuts) {
             let moved = (0..next.len()).filter(|&f| next[f] != labels[f]);
             changed += moved.map(|f| s.surface.area[f]).sum::<f64>();
             *labels = next;

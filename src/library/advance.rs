@@ -6,6 +6,14 @@ use super::collection::{Collection, Regime, discovered, fit, supervised};
 use super::error::Result;
 use super::facade::Library;
 use crate::store::Store;
+use rayon::prelude::*;
+
+/// Stale shapes that [`Library::relabel_batch`] relabels at most: enough for all processors and for
+/// one sync to matter little, and less than a second of work on two.
+pub const MAX_BATCH: usize = 16;
+/// Polygons of all shapes of a batch, of which each is read and cleaned in memory to refine its
+/// boundaries; a larger shape is a batch of its own.
+const MAX_BATCH_POLYGONS: u64 = 500_000;
 
 impl Library {
     /// Recomputes the labels of one stale shape of the collection, or of any if `None`; false: none
@@ -14,36 +22,90 @@ impl Library {
     /// # Errors
     /// There is no such collection, or the store fails.
     pub fn relabel_next(&self, collection: Option<&str>) -> Result<bool> {
+        Ok(self.relabel_batch(collection, 1)? > 0)
+    }
+
+    /// Recomputes the labels of up to `most` stale shapes of the collection, or of one that has any
+    /// if `None`, side by side, and commits them together; how many, where a step of fitting the
+    /// model counts as one. 0: no shape was stale. The labels do not depend on `most`.
+    ///
+    /// # Errors
+    /// There is no such collection, or the store fails. A shape that cannot be relabelled is an
+    /// error once it is the first of those that are stale.
+    pub fn relabel_batch(&self, collection: Option<&str>, most: usize) -> Result<usize> {
         let wanted = collection.map(|name| self.collection_row(name));
         let wanted = wanted.transpose()?;
-        let next = self.store.catalog().read(|r| -> Result<_> {
+        let catalog = self.store.catalog();
+        let next = catalog.read(|r| -> Result<_> {
             let Some(shape) = r.next_stale(wanted.map(|c| c.id))? else {
                 return Ok(None);
             };
             let row = r.collection_by_id(shape.collection)?;
             Ok(row.map(|row| (row, shape.id)))
         })?;
-        let Some((row, id)) = next else {
-            return Ok(false);
+        let Some((row, first)) = next else {
+            return Ok(0);
         };
-        self.with_collection(row, |collection| match collection.position(id) {
-            Some(at) => relabel(&self.store, collection, at),
-            None => Ok(false),
+        self.with_collection(row, |collection| {
+            let Some(first) = collection.position(first) else {
+                return Ok(0);
+            };
+            if let Regime::Supervised(s) = &collection.state().regime
+                && s.phase() != Phase::Fitted
+            {
+                let step = fit::step(collection, &self.store)?;
+                return Ok(usize::from(taken(&self.store, collection, step)?));
+            }
+            let batch = self.batch(collection, first, most)?;
+            relabel(&self.store, collection, &batch)
         })
+    }
+
+    /// The indices of up to `most` stale shapes, from the one at `first` on.
+    fn batch(&self, collection: &Collection, first: usize, most: usize) -> Result<Vec<usize>> {
+        let shapes = collection.shapes();
+        let others = (first + 1..shapes.len()).filter(|at| shapes[*at].stale);
+        let (mut batch, mut n_polygons) = (Vec::new(), 0);
+        for at in [first].into_iter().chain(others).take(most) {
+            let catalog = self.store.catalog();
+            let row = catalog.read(|r| r.shape(shapes[at].id))?;
+            n_polygons += row.map_or(0, |row| row.n_polygons);
+            if n_polygons > MAX_BATCH_POLYGONS && !batch.is_empty() {
+                break;
+            }
+            batch.push(at);
+        }
+        Ok(batch)
     }
 }
 
-/// One step towards the labels of a stale shape: fits the model if the training shapes have
-/// changed, otherwise relabels the shape. False: there was nothing to do.
-fn relabel(store: &Store, collection: &mut Collection, at: usize) -> Result<bool> {
-    let change = match &collection.state().regime {
-        Regime::Discovering => discovered::relabel(collection, store, at)?,
-        Regime::Supervised(s) if s.phase() == Phase::Fitted => {
-            supervised::relabel(collection, store, at)?
+/// Relabels stale shapes side by side and commits them together, in this order; how many.
+/// They are independent of each other: only shapes vote that are not stale, or with the labels that
+/// a person gave them.
+fn relabel(store: &Store, collection: &mut Collection, batch: &[usize]) -> Result<usize> {
+    let is_supervised = collection.state().regime.supervision().is_some();
+    let relabelled = batch.par_iter().map(|at| match is_supervised {
+        true => supervised::relabel(collection, store, *at),
+        false => discovered::relabel(collection, store, *at),
+    });
+    let results: Vec<Result<Option<Change>>> = relabelled.collect();
+    let (mut n, mut all) = (0, Change::default());
+    for (at, result) in results.into_iter().enumerate() {
+        match result {
+            Ok(Some(change)) => {
+                n += 1;
+                all.join(change);
+            }
+            Ok(None) => {}
+            Err(error) if at == 0 => return Err(error),
+            // Those before it are labelled; the next batch begins with it.
+            Err(_) => break,
         }
-        Regime::Supervised(_) => fit::step(collection, store)?,
-    };
-    taken(store, collection, change)
+    }
+    if n > 0 {
+        commit(store, collection, all, |_, _| Ok(()))?;
+    }
+    Ok(n)
 }
 
 /// Relabels those of some shapes that are stale, while labels are discovered; how many.

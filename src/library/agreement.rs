@@ -92,7 +92,7 @@ impl Library {
             let (Some(i), Some(j)) = (at(d.from), at(d.to)) else {
                 continue;
             };
-            let shapes = [&from, &to].map(|k| PreparedShape::new(k.view(), &model));
+            let shapes = [&from, &to].map(|k| PreparedShape::new(&self.store, k.file(), &model));
             let mut tries = vec![shapes[0].map_to(&shapes[1])];
             if let (Some(x), Some(y)) = (place[i], place[j]) {
                 let start = latent.through(x, y);

@@ -114,6 +114,15 @@ pub(super) struct Written {
     state: Option<State>,
 }
 
+impl Change {
+    /// Adds the labels, maps and staleness of another relabelling to those of this one.
+    pub(super) fn join(&mut self, other: Change) {
+        self.maps.extend(other.maps);
+        self.relabelled.extend(other.relabelled);
+        self.stale.extend(other.stale);
+    }
+}
+
 impl From<LabelChange> for LabelEdit {
     fn from(change: LabelChange) -> Self {
         Self::Changed(change)

@@ -3,7 +3,7 @@
 
 use super::error::Result;
 use super::rows::{format_from_name, to_json};
-use super::sources::{Known, Sources};
+use super::sources::{FileView, Known, Sources};
 use super::types::{LabelId, LabelMove, PartInfo, Source};
 use crate::correspondence::parts;
 use crate::labels::refine_boundary;
@@ -79,13 +79,13 @@ pub(super) struct Original<'a> {
 /// labels of the classes, and `epoch` that of their model.
 pub(super) fn new_labels(
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
     labelling: &Labelling,
     (ids, epoch): (&[LabelId], u64),
     original: Original<'_>,
 ) -> Result<NewLabels> {
     let k = ids.len();
-    let surface = Surface::new(&view.mesh());
+    let (view, surface) = (&shape.view, sources.surface(shape));
     let class_of_polygon = polygon_classes(sources, view, labelling, k, original)?;
     let probability = |proxy_face: usize, class: u32| {
         f64::from(labelling.probabilities[proxy_face * k + class as usize]) / 255.0
@@ -132,7 +132,7 @@ pub(super) fn new_labels_of(
         digest: &known.row.content_digest,
         format: &known.row.format,
     };
-    new_labels(sources, &known.view(), labelling, ids, original)
+    new_labels(sources, known.file(), labelling, ids, original)
 }
 
 /// Share of the area that each label covers.

@@ -16,6 +16,7 @@ use super::types::{LabelId, LabelInfo, RequestKey};
 use crate::pipeline::{LabelChange, Prepared, split_faces, split_model};
 use crate::segmentation::Surface;
 use crate::store::{CollectionRow, LabelRow, LabelSummary, LabelVersionRow, ShapeId};
+use std::sync::Arc;
 
 /// New ids of a shape's proxy faces and polygons, and its probabilities.
 struct Renamed {
@@ -186,8 +187,8 @@ fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Resu
         .collect();
     let known = chosen.iter().map(|at| sources.known(shapes[*at].id));
     let known: Vec<Known> = known.collect::<Result<_>>()?;
-    let prepared = known.iter().map(|k| Prepared::new(&k.view(), model));
-    let prepared: Vec<Prepared> = prepared.collect();
+    let prepared = known.iter().map(|k| sources.prepared(k.file(), model));
+    let prepared: Vec<Arc<Prepared>> = prepared.collect();
     let is_in = known.iter().map(|k| {
         let labels = k.labels.proxy_labels.iter();
         labels.map(|l| *l == label as i32).collect()

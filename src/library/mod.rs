@@ -65,6 +65,7 @@ mod types;
 mod upright;
 mod voting;
 
+pub use advance::MAX_BATCH;
 pub use agreement::Disagreement;
 pub use collection::discovered::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use collections::MAX_PARTS;

@@ -12,11 +12,12 @@ use super::lookup::object_length;
 use super::reason::{Code, Reason};
 use super::refusal::failure;
 use super::rows::{report_to_json, to_json};
+use super::sources::FileView;
 use super::submit::{Described, read_by_first_release};
 use super::types::{Failure, ItemState, JobItem, NewShape as ShapeToAdd, Outcome, Placed};
 use super::voting::Voted;
 use crate::mesh::CleanReport;
-use crate::pipeline::{Description, DescriptionView};
+use crate::pipeline::Description;
 use crate::store::{
     ItemStatus, JobItemRow, Kept, NewShapeRow, ObjectRow, ShapeId, ShapeRow, Store, Tx,
 };
@@ -160,7 +161,10 @@ fn place(
 ) -> Result<Placed> {
     let ((object, _kept), mut stages) = store_description(store, &described)?;
     let new = NewShape {
-        view: described.description.view(),
+        arrays: FileView {
+            view: described.description.view(),
+            file: object.blake3,
+        },
         digest: accepted.item.original_digest,
     };
     let (outcome, version) = match replaced {
@@ -168,7 +172,7 @@ fn place(
         None => (Outcome::Added, 1),
     };
     let lost_training = replaced.map_or(Ok(false), |old| set_aside(store, collection, old.id))?;
-    let (voted, n_fresh) = label_new(store, collection, &new.view)?;
+    let (voted, n_fresh) = label_new(store, collection, new.arrays)?;
     let (labelling, sources, maps) = Voted::parts(voted);
     let n_inconsistent = n_inconsistent(store, &maps)?;
     stages.lap("place");
@@ -240,18 +244,18 @@ fn set_aside(store: &Store, collection: &mut Collection, id: ShapeId) -> Result<
 fn label_new(
     store: &Store,
     collection: &mut Collection,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
 ) -> Result<(Option<Voted>, u32)> {
     fit_model(store, collection)?;
     if collection.state().regime.supervision().is_some() {
-        return Ok((supervised::label_new(collection, store, view)?, 0));
+        return Ok((supervised::label_new(collection, store, shape)?, 0));
     }
     if collection.model().is_none() {
         return Ok((None, 0));
     }
-    let nearest = discovered::sources_for(collection, store, view)?;
+    let nearest = discovered::sources_for(collection, store, shape)?;
     let n_fresh = relabel_all(store, collection, &nearest)?;
-    let voted = discovered::label_new(collection, store, view, &nearest)?;
+    let voted = discovered::label_new(collection, store, shape, &nearest)?;
     Ok((voted, n_fresh))
 }
 
@@ -278,7 +282,8 @@ fn plan(
     };
     if plan.state.up_disagrees.is_none() && collection.up().axis().is_some() {
         // As in collections that were begun when nobody asked.
-        let found = discovered::up_found(collection, store, collection.up(), Some(&new.view))?;
+        let found =
+            discovered::up_found(collection, store, collection.up(), Some(&new.arrays.view))?;
         plan.state.up_disagrees = found.disagrees;
     }
     Ok(plan)
@@ -297,7 +302,7 @@ fn labels_of_new(
         format: &accepted.item.format,
     };
     let ids = (&model.labels[..], model.epoch);
-    let mut labels = new_labels(store, &new.view, &plan.labelling, ids, original)?;
+    let mut labels = new_labels(store, new.arrays, &plan.labelling, ids, original)?;
     labels.row.version = version;
     Ok(labels)
 }

@@ -161,7 +161,7 @@ impl Library {
         let model = self.with_collection(row, |c| Ok(c.label_model().cloned()))?;
         let model = model.ok_or_else(|| damaged("collections", "shapes without a label model"))?;
         let (a, b) = (self.store.known(a.id)?, self.store.known(b.id)?);
-        let shapes = [a.view(), b.view()].map(|view| PreparedShape::new(view, &model));
+        let shapes = [a.file(), b.file()].map(|file| PreparedShape::new(&self.store, file, &model));
         let found = shapes[0].map_to(&shapes[1]);
         let (k1, k2) = (found.k1, found.k2);
         Ok(MapInfo {

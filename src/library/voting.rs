@@ -3,25 +3,28 @@
 use super::collection::Collection;
 use super::error::Result;
 use super::rows::confidence_of_row;
-use super::sources::{Known, Sources};
+use super::sources::{FileView, Known, Sources};
 use super::types::Source;
 use crate::fmap::{Confidence, FunctionalMap, MapOptions};
 use crate::labels::LabelModel;
 use crate::pipeline::{DescriptionView, Labelling, Prepared, Vote, map, map_from, unlikeness};
 use crate::store::{MapRow, ShapeId};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// A shape with what labelling derives from it under a label model.
 #[derive(Debug)]
 pub(super) struct PreparedShape<'a> {
     pub(super) view: DescriptionView<'a>,
-    pub(super) prepared: Prepared,
+    pub(super) prepared: Arc<Prepared>,
 }
 
 impl<'a> PreparedShape<'a> {
-    pub(super) fn new(view: DescriptionView<'a>, model: &LabelModel) -> Self {
-        let prepared = Prepared::new(&view, model);
-        Self { view, prepared }
+    pub(super) fn new(sources: &dyn Sources, shape: FileView<'a>, model: &LabelModel) -> Self {
+        Self {
+            view: shape.view,
+            prepared: sources.prepared(shape, model),
+        }
     }
 
     /// Computes the functional map from this shape to another.
@@ -42,8 +45,12 @@ impl<'a> PreparedShape<'a> {
         start: (&[f32], usize),
     ) -> FunctionalMap {
         let options = MapOptions::default();
-        let (one, two) = ((&self.view, &self.prepared), (&to.view, &to.prepared));
-        map_from(one, two, start, &options)
+        map_from(
+            (&self.view, &self.prepared),
+            (&to.view, &to.prepared),
+            start,
+            &options,
+        )
     }
 }
 
@@ -200,17 +207,24 @@ pub(super) fn sources_of(voters: &[Voter], weights: &[f64]) -> Vec<Source> {
 }
 
 /// Computes the map from a stored shape to another one.
-pub(super) fn new_map(from: &Known, to: &PreparedShape<'_>, model: &LabelModel) -> FunctionalMap {
-    PreparedShape::new(from.view(), model).map_to(to)
+pub(super) fn new_map(
+    sources: &dyn Sources,
+    from: &Known,
+    to: &PreparedShape<'_>,
+    model: &LabelModel,
+) -> FunctionalMap {
+    PreparedShape::new(sources, from.file(), model).map_to(to)
 }
 
 /// Computes the map from each voter to a shape.
 pub(super) fn new_maps(
+    sources: &dyn Sources,
     voters: &[Voter],
     to: &PreparedShape<'_>,
     model: &LabelModel,
 ) -> Vec<FunctionalMap> {
-    let maps = voters.par_iter().map(|v| new_map(&v.known, to, model));
+    let voters = voters.par_iter();
+    let maps = voters.map(|v| new_map(sources, &v.known, to, model));
     maps.collect()
 }
 
@@ -219,22 +233,25 @@ pub(super) fn new_maps(
 pub(super) fn rank_candidates(
     collection: &Collection,
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
     among: &[usize],
     limit: usize,
 ) -> Result<Vec<usize>> {
-    let nearest = collection.nearest_among(among, view.signature, view.n_descriptors, 2 * limit);
+    let nearest = {
+        let view = &shape.view;
+        collection.nearest_among(among, view.signature, view.n_descriptors, 2 * limit)
+    };
     let nearest: Vec<usize> = nearest.into_iter().map(|(at, _)| at).collect();
     let Some(model) = collection.label_model().filter(|_| nearest.len() > limit) else {
         return Ok(nearest);
     };
-    let shape = Prepared::new(view, model);
-    let mut found = Vec::with_capacity(nearest.len());
-    for at in nearest {
-        let known = sources.known(collection.shapes()[at].id)?;
-        let known = Prepared::new(&known.view(), model);
-        found.push((unlikeness(&known, &shape), at));
-    }
+    let shape = sources.prepared(shape, model);
+    let compared = nearest.into_par_iter().map(|at| {
+        let known = sources.arrays(collection.shapes()[at].id)?;
+        let known = sources.prepared(known.view(), model);
+        Ok((unlikeness(&known, &shape), at))
+    });
+    let mut found: Vec<(f64, usize)> = compared.collect::<Result<_>>()?;
     found.sort_by(|a, b| a.0.total_cmp(&b.0));
     found.truncate(limit);
     Ok(found.into_iter().map(|(_, at)| at).collect())

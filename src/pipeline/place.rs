@@ -10,6 +10,7 @@ use crate::labels::cut::{STRENGTH, cut};
 use crate::labels::{Features, LabelModel, Statistics};
 use crate::linalg::nearest::nearest_rows;
 use crate::segmentation::Surface;
+use std::sync::Arc;
 
 /// Probabilities below this count as this: one source must not veto what all others say.
 pub(super) const FLOOR: f64 = 0.02;
@@ -24,7 +25,7 @@ const MOST_CERTAIN: f64 = 0.98;
 #[derive(Debug, Clone)]
 pub struct Prepared {
     /// Its dual graph.
-    pub surface: Surface,
+    pub surface: Arc<Surface>,
     /// Standardised face descriptors `(m, dim)`.
     pub features: Features,
     /// The same at its vertices `(n, dim)`.
@@ -34,7 +35,11 @@ pub struct Prepared {
 impl Prepared {
     /// Prepares a shape.
     pub fn new(shape: &DescriptionView<'_>, model: &LabelModel) -> Self {
-        let surface = Surface::new(&shape.mesh());
+        Self::on(Arc::new(Surface::new(&shape.mesh())), shape, model)
+    }
+
+    /// Prepares a shape whose surface is known.
+    pub fn on(surface: Arc<Surface>, shape: &DescriptionView<'_>, model: &LabelModel) -> Self {
         let features = model
             .normalisation
             .standardise(&Features::raw(shape, model.up));

@@ -8,6 +8,8 @@ use crate::labels::{
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
+use rayon::prelude::*;
+use std::sync::Arc;
 
 /// A representative shape and the labels its faces carry now.
 #[derive(Debug, Clone, Copy)]
@@ -112,7 +114,7 @@ pub fn recluster(
         up: options.up,
     };
     let labellings = classes
-        .into_iter()
+        .into_par_iter()
         .zip(prepared)
         .map(|(c, p)| Labelling::given(c, p, &model))
         .collect();
@@ -134,23 +136,23 @@ struct Together {
 
 impl Together {
     fn new(shapes: &[DescriptionView<'_>], up: Option<[f64; 3]>) -> Self {
-        let raw: Vec<Features> = shapes.iter().map(|s| Features::raw(s, up)).collect();
-        let surfaces: Vec<Surface> = shapes.iter().map(|s| Surface::new(&s.mesh())).collect();
+        let raw: Vec<Features> = shapes.par_iter().map(|s| Features::raw(s, up)).collect();
+        let surfaces: Vec<Surface> = shapes.par_iter().map(|s| Surface::new(&s.mesh())).collect();
         let normalisation = Normalisation::fit(
             raw.iter().zip(surfaces.iter().map(|s| s.area.as_slice())),
             up.is_some(),
         );
         let prepared: Vec<Prepared> = raw
-            .iter()
+            .par_iter()
             .zip(surfaces)
             .map(|(raw, surface)| Prepared {
-                surface,
+                surface: Arc::new(surface),
                 features: normalisation.standardise(raw),
                 at_vertices: Vec::new(),
             })
             .collect();
         let patches = prepared
-            .iter()
+            .par_iter()
             .zip(shapes)
             .map(|(p, s)| PatchGraph::new(&p.surface, s.patches))
             .collect();
@@ -269,11 +271,11 @@ mod tests {
     /// One shape of a few faces of equal area.
     fn faces(n: usize) -> Vec<Prepared> {
         vec![Prepared {
-            surface: Surface {
+            surface: Arc::new(Surface {
                 area: vec![1.0 / n as f64; n],
                 centroids: vec![[0.0; 3]; n],
                 edges: Vec::new(),
-            },
+            }),
             features: Features {
                 data: Vec::new(),
                 dim: 0,

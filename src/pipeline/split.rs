@@ -8,6 +8,7 @@ use crate::labels::cut::{STRENGTH, cut};
 use crate::labels::{Classifier, Statistics};
 use crate::linalg::kmeans::kmeans;
 use crate::segmentation::Surface;
+use std::sync::Arc;
 
 const SEED: u64 = 1;
 const N_STARTS: usize = 10;
@@ -15,7 +16,7 @@ const N_STARTS: usize = 10;
 /// The discriminant of the two halves of a label, given the shapes, the patch of each of their faces, and which of
 /// these carry the label. The second class is the smaller one. `None`: it has fewer than two patches.
 pub fn split_model(
-    shapes: &[Prepared],
+    shapes: &[Arc<Prepared>],
     patches: &[&[u32]],
     is_in: &[Vec<bool>],
 ) -> Option<Classifier> {

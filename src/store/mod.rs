@@ -33,6 +33,7 @@ mod health;
 pub mod lock;
 pub mod mapped;
 pub mod objects;
+pub mod prepared;
 pub mod quarantine;
 mod reserve;
 pub mod rows;
@@ -46,6 +47,7 @@ pub use error::StoreError;
 pub use health::Health;
 pub use mapped::MappedDescription;
 pub use objects::{Kept, Objects};
+pub use prepared::PreparedShapes;
 pub use rows::{
     CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
     LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
@@ -61,6 +63,7 @@ use std::time::Duration;
 /// An open library folder, held by this process alone.
 pub struct Store {
     objects: Objects,
+    prepared: PreparedShapes,
     catalog: Catalog,
     health: Health,
     dir: PathBuf,
@@ -99,6 +102,7 @@ impl Store {
         }
         Ok(Self {
             objects,
+            prepared: PreparedShapes::default(),
             catalog,
             health,
             dir: dir.to_path_buf(),
@@ -123,6 +127,11 @@ impl Store {
                 .map_err(|e| StoreError::io(&self.dir, e)),
             None => Ok(()),
         }
+    }
+
+    /// Shapes prepared for labelling.
+    pub fn prepared(&self) -> &PreparedShapes {
+        &self.prepared
     }
 
     /// The object files.

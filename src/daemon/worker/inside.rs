@@ -22,7 +22,8 @@ use std::io::{self, Read};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::mpsc;
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::Duration;
 
 /// Workers have a lower priority than the daemon, which has to answer meanwhile.
 const NICENESS: i32 = 5;
@@ -33,6 +34,11 @@ const RESERVATIONS: u64 = 64 << 30;
 /// The file and the score that let the kernel end this process before the daemon when memory runs
 /// out.
 const OOM_SCORE: (&str, &str) = ("/proc/self/oom_score_adj", "500");
+/// Array files stay mapped until no work has arrived for so long.
+const IDLE: Duration = Duration::from_millis(200);
+/// Bytes of array files that stay mapped between pieces of work: those of the shapes that vote in a
+/// collection of the default working faces. They are no memory that this process holds alone.
+const MAPPED_BYTES: usize = 256 << 20;
 /// The library that a worker has opened, with its folder.
 type Opened = Option<(PathBuf, Library)>;
 
@@ -58,10 +64,23 @@ fn work() -> io::Result<()> {
     let _ = std::fs::write(OOM_SCORE.0, OOM_SCORE.1);
     start_threads().map_err(io::Error::other)?;
     let poisoned = std::env::var_os(POISON_VARIABLE).is_some();
-    let (mut library, mut is_nice) = (None, false);
+    let (mut library, mut is_nice): (Opened, bool) = (None, false);
     let work = read_ahead()?;
     write_frame(READY, &[])?;
-    for next in work {
+    loop {
+        let next = match work.recv_timeout(IDLE) {
+            Err(RecvTimeoutError::Timeout) => {
+                if let Some((_, library)) = &library {
+                    // Mapped files take up disk space even when they are removed.
+                    library.store().objects().unmap();
+                }
+                work.recv().ok()
+            }
+            received => received.ok(),
+        };
+        let Some(next) = next else {
+            return Ok(());
+        };
         let (header, bytes) = next?;
         limit_reservations(header["memory"].as_u64().unwrap_or(MEMORY_MARGIN))?;
         let max_answer = header["answer"].as_u64();
@@ -82,12 +101,7 @@ fn work() -> io::Result<()> {
             describe(&header, &bytes, poisoned)?
         };
         write_frame(OUTCOME, &outcome)?;
-        if let Some((_, library)) = &library {
-            // Mapped files take up disk space even when they are removed.
-            library.store().objects().unmap();
-        }
     }
-    Ok(())
 }
 
 /// Starts the threads that share the work on one shape, before the work, so that the shape is not
@@ -159,7 +173,15 @@ fn describe(header: &Value, bytes: &[u8], poisoned: bool) -> io::Result<Vec<u8>>
 fn opened<'a>(header: &Value, open: &'a mut Opened) -> Result<&'a Library, LibraryError> {
     let dir = Path::new(header["library"].as_str().unwrap_or_default());
     if open.as_ref().is_none_or(|(of, _)| of != dir) {
-        *open = Some((dir.to_path_buf(), Library::open_beside(dir)?));
+        let library = Library::open_beside(dir)?;
+        library.store().objects().set_cache_bytes(MAPPED_BYTES);
+        // A worker that answers keeps none.
+        let prepared_bytes = header["prepared"].as_u64().unwrap_or(0);
+        library
+            .store()
+            .prepared()
+            .set_max_bytes(prepared_bytes as usize);
+        *open = Some((dir.to_path_buf(), library));
     }
     let library = open.as_ref().map(|(_, library)| library);
     Ok(library.expect("invariant: it was just opened"))
@@ -245,8 +267,9 @@ fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
     let placed = catch_unwind(AssertUnwindSafe(|| {
         let library = opened(header, open)?;
         if let Some(collection) = header["relabel"].as_str() {
-            let more = library.relabel_next(Some(collection))?;
-            return Ok(report::relabelled(more));
+            let most = header["most"].as_u64().unwrap_or(1) as usize;
+            let n_shapes = library.relabel_batch(Some(collection), most)?;
+            return Ok(report::relabelled(n_shapes));
         }
         let ticket = &header["place"];
         if poisoned {

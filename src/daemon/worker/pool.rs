@@ -31,8 +31,8 @@ pub(crate) enum Placing<'a> {
     /// Place the shape of this ticket ([`crate::Library::placement_ticket`]), whose file has this
     /// number of bytes.
     Place(&'a Value, u64),
-    /// Relabel one stale shape of a collection.
-    Relabel(&'a str),
+    /// Relabel at most so many stale shapes of a collection.
+    Relabel(&'a str, usize),
 }
 
 /// Workers that wait for work.
@@ -44,6 +44,8 @@ pub(crate) struct Pool {
     library: PathBuf,
     n_workers: usize,
     threads: usize,
+    /// Bytes of prepared shapes that each placing worker keeps.
+    prepared_bytes: u64,
 }
 
 /// Processes, each with the collection that it served last and has in memory.
@@ -55,8 +57,9 @@ fn locked<T>(idle: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
 }
 
 impl Pool {
-    /// Starts the first worker, to see that it can be. `library` is the folder of the open library.
-    pub(crate) fn new(library: &Path, n_workers: usize) -> io::Result<Self> {
+    /// Starts the first worker, to see that it can be. `library` is the folder of the open library;
+    /// all placing workers together keep `prepared_bytes` of prepared shapes.
+    pub(crate) fn new(library: &Path, n_workers: usize, prepared_bytes: u64) -> io::Result<Self> {
         let processors = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = THREADS_PER_PROCESSOR * processors / n_workers.max(1);
         let pool = Self {
@@ -66,6 +69,7 @@ impl Pool {
             library: library.to_path_buf(),
             n_workers: n_workers.max(1),
             threads: threads.clamp(1, processors),
+            prepared_bytes: prepared_bytes / n_workers.max(1) as u64,
         };
         let first = Process::start(pool.threads)?.ready(FIRST_START);
         locked(&pool.describing).push(first.map_err(io::Error::other)?);
@@ -149,7 +153,7 @@ impl Pool {
         work: Placing<'_>,
         wanted: &dyn Fn() -> bool,
     ) -> Result<Value, Ended> {
-        let mut header = json!({ "library": self.library });
+        let mut header = json!({ "library": self.library, "prepared": self.prepared_bytes });
         let mut memory = PLACE_MEMORY;
         match work {
             Placing::Place(ticket, n_bytes) => {
@@ -158,7 +162,10 @@ impl Pool {
                 let reading = Limits::to_describe(n_bytes);
                 memory += 2 * reading;
             }
-            Placing::Relabel(collection) => header["relabel"] = json!(collection),
+            Placing::Relabel(collection, most) => {
+                header["relabel"] = json!(collection);
+                header["most"] = json!(most);
+            }
         }
         let work = Work {
             header,

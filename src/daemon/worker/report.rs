@@ -14,8 +14,8 @@ use serde_json::{Value, json};
 pub(crate) enum Outcome {
     /// The shape is placed, or finished otherwise.
     State(ItemState),
-    /// Whether a shape was stale, and was relabelled.
-    Relabelled(bool),
+    /// How many stale shapes were relabelled.
+    Relabelled(u64),
     /// The library refused or failed.
     Failed(Failure),
 }
@@ -35,9 +35,9 @@ pub(super) fn placed(state: &ItemState) -> Value {
     json!({ "state": library::state_to_json(state) })
 }
 
-/// The report whether a shape was relabelled.
-pub(super) fn relabelled(more: bool) -> Value {
-    json!({ "more": more })
+/// The report of how many shapes were relabelled.
+pub(super) fn relabelled(n_shapes: usize) -> Value {
+    json!({ "relabelled": n_shapes })
 }
 
 /// The report of a panic.
@@ -65,8 +65,8 @@ pub(crate) fn read_report(report: &Value) -> Result<Report, String> {
     }
     let bad = |e: &dyn std::fmt::Display| format!("a worker reported {report}: {e}");
     Ok(Report::Outcome(
-        if let Some(more) = report["more"].as_bool() {
-            Outcome::Relabelled(more)
+        if let Some(n_shapes) = report["relabelled"].as_u64() {
+            Outcome::Relabelled(n_shapes)
         } else if let Some(text) = text("panic") {
             Outcome::Failed(panicked(&text))
         } else if let Some(failure) = report.get("error") {

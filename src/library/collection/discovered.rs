@@ -8,7 +8,7 @@ use crate::labels::DiscoveryOptions;
 use crate::library::change::Change;
 use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause, face_ids, new_labels_of};
-use crate::library::sources::{Known, Sources};
+use crate::library::sources::{FileView, Known, Sources};
 use crate::library::types::{EventKind, Up};
 use crate::library::voting::{
     IncomingMap, PreparedShape, Voted, Voter, new_maps, rank_candidates, sources_of, votes,
@@ -37,7 +37,7 @@ const RECLUSTER_GROWTH: f64 = 1.4;
 /// A described shape that is not stored yet.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::library) struct NewShape<'a> {
-    pub(in crate::library) view: DescriptionView<'a>,
+    pub(in crate::library) arrays: FileView<'a>,
     /// Of its original bytes.
     pub(in crate::library) digest: Digest,
 }
@@ -93,17 +93,17 @@ pub fn next_recluster(n_shapes: u64) -> u64 {
 pub(in crate::library) fn sources_for(
     collection: &Collection,
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
 ) -> Result<Vec<usize>> {
     let all: Vec<usize> = (0..collection.shapes().len()).collect();
-    rank_candidates(collection, sources, view, &all, MAX_MAPS)
+    rank_candidates(collection, sources, shape, &all, MAX_MAPS)
 }
 
 /// Maps the shapes `nearest` to a new one and labels it; `None`: there is no model yet.
 pub(in crate::library) fn label_new(
     collection: &Collection,
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
     nearest: &[usize],
 ) -> Result<Option<Voted>> {
     let Some(model) = collection.label_model() else {
@@ -114,8 +114,8 @@ pub(in crate::library) fn label_new(
         Ok(Voter::new(known, model))
     };
     let voters: Vec<Voter> = nearest.iter().map(voter).collect::<Result<_>>()?;
-    let shape = PreparedShape::new(*view, model);
-    let maps = new_maps(&voters, &shape, model);
+    let shape = PreparedShape::new(sources, shape, model);
+    let maps = new_maps(sources, &voters, &shape, model);
     let incoming: Vec<IncomingMap> = maps.iter().map(IncomingMap::from).collect();
     let labelling = label(
         &shape.view,
@@ -141,7 +141,7 @@ pub(in crate::library) fn plan(
 ) -> Result<Plan> {
     match (labelling, collection.model()) {
         (Some(labelling), Some(model)) if !is_due(collection) => {
-            Ok(grown(collection, model, labelling, &new.view))
+            Ok(grown(collection, sources, model, labelling, new.arrays))
         }
         (labelling, _) => reclustered(collection, sources, new, labelling),
     }
@@ -150,13 +150,14 @@ pub(in crate::library) fn plan(
 /// An addition without a re-clustering.
 fn grown(
     collection: &Collection,
+    sources: &dyn Sources,
     model: &ModelState,
     labelling: Labelling,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
 ) -> Plan {
     let mut model = model.clone();
-    let shape = PreparedShape::new(*view, &model.model);
-    let statistics = labelling.statistics(&shape.prepared, model.model.labels.len());
+    let prepared = sources.prepared(shape, &model.model);
+    let statistics = labelling.statistics(&prepared, model.model.labels.len());
     model.model.statistics.accumulate(&statistics, 1.0);
     Plan {
         model,
@@ -192,7 +193,7 @@ fn reclustered(
     {
         // The epoch goes on: stale shapes are labelled by the model and the representatives that
         // made them so, whether that happens before or after this.
-        let mut plan = grown(collection, model, labelling, &new.view);
+        let mut plan = grown(collection, sources, model, labelling, new.arrays);
         plan.state.next_recluster = next_recluster;
         plan.state.up_disagrees = found.up.disagrees;
         plan.reclustered = Some(event);
@@ -288,7 +289,7 @@ fn cluster(
         // The new shape, too, has its place by its digest.
         new_at = chosen.partition_point(|at| collection.shapes()[*at].digest <= new.digest);
         let new = Representative {
-            shape: new.view,
+            shape: new.arrays.view,
             labels: &new_ids,
         };
         shapes.insert(new_at, new);
@@ -397,7 +398,7 @@ pub(in crate::library) fn relabel(
             maps.push(IncomingMap::of_row(map)?);
         }
     }
-    let prepared = PreparedShape::new(known.view(), &model);
+    let prepared = PreparedShape::new(sources, known.file(), &model);
     let votes = votes(&voters, &maps);
     let labelling = label(&prepared.view, &prepared.prepared, &model, &votes);
     let labels = new_labels_of(sources, &known, &labelling, (&model.labels, model.epoch))?;
@@ -425,7 +426,7 @@ pub(in crate::library) fn model_without(
         return Ok(None);
     };
     let known = sources.known(id)?;
-    let shape = PreparedShape::new(known.view(), &model.model);
+    let shape = PreparedShape::new(sources, known.file(), &model.model);
     let classes = classes_of(&known.labels.proxy_labels, &model.model.labels);
     let given = Labelling::given(classes, &shape.prepared, &model.model);
     let statistics = given.statistics(&shape.prepared, model.model.labels.len());

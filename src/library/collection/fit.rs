@@ -1,7 +1,7 @@
 //! The label model is fitted to the training shapes: a few representatives are labelled together.
 //!
 //! Every step is a change of its own, so that none takes long and a crash loses little: descriptors
-//! are standardised, missing maps between the representatives are computed one shape at a time,
+//! are standardised, missing maps between the representatives are computed a few shapes at a time,
 //! then the model is fitted to all of them at once.
 
 use super::discovered::{MAX_MAPS, MAX_REPRESENTATIVES};
@@ -9,7 +9,6 @@ use super::state::{Phase, Supervision};
 use super::supervised::{propagated, with};
 use super::up::UpFound;
 use super::{Collection, ModelState};
-use crate::fmap::FunctionalMap;
 use crate::labels::{Features, LabelModel, Normalisation, Statistics};
 use crate::library::change::{Change, map_row};
 use crate::library::error::Result;
@@ -24,9 +23,14 @@ use crate::segmentation::Surface;
 use crate::store::LabelRow;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 /// Most training shapes among the representatives that the model is fitted to.
 const MAX_FITTED_TRAINING: usize = MAX_REPRESENTATIVES / 2;
+
+/// Maps that one step computes side by side, if so many are missing: enough for all processors, and
+/// about a second of work on two.
+const MAPS_A_STEP: usize = 40;
 
 /// A representative that the model is fitted to.
 struct Member {
@@ -113,7 +117,7 @@ impl Fit<'_> {
         let mut model = self.model.clone();
         if self.supervision.phase() == Phase::Standardised {
             for known in self.known()? {
-                let prepared = Prepared::new(&known.view(), &model);
+                let prepared = self.sources.prepared(known.file(), &model);
                 let class = |f: usize| {
                     let label = i64::from(known.labels.proxy_labels[f]);
                     let found = model.labels.iter().position(|l| i64::from(*l) == label);
@@ -141,9 +145,9 @@ impl Fit<'_> {
         let views: Vec<DescriptionView<'_>> = known.iter().map(Known::view).collect();
         let found = UpFound::of(self.collection.up(), &views.iter().collect::<Vec<_>>());
         let up = found.axis;
-        let parts: Vec<(Features, Surface)> = views
+        let parts: Vec<(Features, Arc<Surface>)> = known
             .par_iter()
-            .map(|v| (Features::raw(v, up), Surface::new(&v.mesh())))
+            .map(|k| (Features::raw(&k.view(), up), self.sources.surface(k.file())))
             .collect();
         let weighted = parts.iter().map(|(f, s)| (f, s.area.as_slice()));
         let normalisation = Normalisation::fit(weighted, up.is_some());
@@ -184,32 +188,33 @@ impl Fit<'_> {
             .collect()
     }
 
-    /// Computes the maps that are missing to the first member that lacks some; `None`: none does.
+    /// Computes maps that are missing between members: all to one member, and to more of them until
+    /// they are [`MAPS_A_STEP`]; `None`: none is missing.
     fn missing_maps(&self, known: &[Known]) -> Result<Option<Change>> {
+        let mut missing = Vec::new();
         for to in 0..known.len() {
-            let mut missing = Vec::new();
             for from in self.voters_of(known, to) {
-                let stored = self.sources.map(known[from].row.id, known[to].row.id)?;
-                if stored.is_none() {
-                    missing.push(&known[from]);
+                if !self.sources.has_map(known[from].row.id, known[to].row.id)? {
+                    missing.push((from, to));
                 }
             }
-            if missing.is_empty() {
-                continue;
+            if missing.len() >= MAPS_A_STEP {
+                break;
             }
-            let shape = PreparedShape::new(known[to].view(), self.model);
-            let maps: Vec<FunctionalMap> = missing
-                .par_iter()
-                .map(|from| new_map(from, &shape, self.model))
-                .collect();
-            let rows = missing.iter().zip(&maps);
-            let rows = rows.map(|(from, map)| map_row(from.row.id, known[to].row.id, map));
-            return Ok(Some(Change {
-                maps: rows.collect(),
-                ..Change::default()
-            }));
         }
-        Ok(None)
+        if missing.is_empty() {
+            return Ok(None);
+        }
+        let maps = missing.par_iter().map(|(from, to)| {
+            let (from, to) = (&known[*from], &known[*to]);
+            let shape = PreparedShape::new(self.sources, to.file(), self.model);
+            let map = new_map(self.sources, from, &shape, self.model);
+            map_row(from.row.id, to.row.id, &map)
+        });
+        Ok(Some(Change {
+            maps: maps.collect(),
+            ..Change::default()
+        }))
     }
 
     /// Labels the representatives together and fits the model to them.
@@ -222,7 +227,10 @@ impl Fit<'_> {
         let maps = self.incoming_maps(&known)?;
         let members = self.members(known, &model.labels)?;
         let views: Vec<DescriptionView<'_>> = members.iter().map(|m| m.known.view()).collect();
-        let prepared: Vec<Prepared> = views.par_iter().map(|v| Prepared::new(v, &model)).collect();
+        let prepared: Vec<Arc<Prepared>> = members
+            .par_iter()
+            .map(|m| self.sources.prepared(m.known.file(), &model))
+            .collect();
         let lessons: Vec<Lesson<'_>> = members
             .iter()
             .zip(&views)
@@ -386,7 +394,7 @@ impl Fit<'_> {
                 continue;
             }
             let known = self.sources.known(shape.id)?;
-            let shape = PreparedShape::new(known.view(), model);
+            let shape = PreparedShape::new(self.sources, known.file(), model);
             let pinned = pinned_faces(&shape.view, &self.pins(at)?, &model.labels);
             let of = |class: &dyn Fn(usize) -> Option<u32>| {
                 let prepared = &shape.prepared;
@@ -442,7 +450,7 @@ impl Fit<'_> {
                 continue;
             };
             let known = self.sources.known(shape.id)?;
-            let prepared = Prepared::new(&known.view(), model);
+            let prepared = self.sources.prepared(known.file(), model);
             let most = |f: usize| {
                 let row = &old.proxy_probabilities[f * k..(f + 1) * k];
                 most_likely(row).map(|l| l as u32)

@@ -11,12 +11,12 @@ use crate::library::change::{Change, map_row};
 use crate::library::error::Result;
 use crate::library::labelling::{NewLabels, Relabelled, area_shares, cause, new_labels_of};
 use crate::library::pins::{Instead, pin_polygons, pinned_faces, pins_of, used_labels};
-use crate::library::sources::{Known, Sources};
+use crate::library::sources::{FileView, Known, Sources};
 use crate::library::voting::{
     IncomingMap, PreparedShape, Voted, Voter, new_map, new_maps, one_hot, rank_candidates,
     sources_of, votes,
 };
-use crate::pipeline::{DescriptionView, Labelling, TeachOptions, label_taught};
+use crate::pipeline::{Labelling, TeachOptions, label_taught};
 use crate::store::ShapeId;
 use rayon::prelude::*;
 
@@ -95,15 +95,15 @@ pub(in crate::library) fn refit(
 pub(in crate::library) fn label_new(
     collection: &Collection,
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
 ) -> Result<Option<Voted>> {
     let supervised = collection.state().regime.supervision().is_some();
     let Some(model) = collection.model().filter(|_| supervised) else {
         return Ok(None);
     };
-    let shape = PreparedShape::new(*view, &model.model);
-    let voters = voters(collection, sources, view, None)?;
-    let maps = new_maps(&voters, &shape, &model.model);
+    let voters = voters(collection, sources, shape, None)?;
+    let shape = PreparedShape::new(sources, shape, &model.model);
+    let maps = new_maps(sources, &voters, &shape, &model.model);
     let incoming: Vec<IncomingMap> = maps.iter().map(IncomingMap::from).collect();
     let labelling = labelled(&shape, model, &voters, &incoming, &[]);
     Ok(Some(Voted::new(labelling, &voters, maps)))
@@ -163,8 +163,8 @@ pub(in crate::library) fn relabel(
         }));
     }
     let known = sources.known(shape.id)?;
-    let prepared = PreparedShape::new(known.view(), &model.model);
-    let voters = voters(collection, sources, &prepared.view, Some(at))?;
+    let prepared = PreparedShape::new(sources, known.file(), &model.model);
+    let voters = voters(collection, sources, known.file(), Some(at))?;
     let maps = maps_into(sources, &voters, &known, &prepared, &model.model)?;
     let pinned = pinned_faces(&prepared.view, &pins, &model.model.labels);
     let incoming: Vec<IncomingMap> = maps.iter().map(|(m, _)| m.clone()).collect();
@@ -204,7 +204,7 @@ pub(in crate::library) fn propagated(
 fn voters(
     collection: &Collection,
     sources: &dyn Sources,
-    view: &DescriptionView<'_>,
+    shape: FileView<'_>,
     exclude: Option<usize>,
 ) -> Result<Vec<Voter>> {
     let supervision = collection.state().regime.supervision();
@@ -216,7 +216,7 @@ fn voters(
         let among: Vec<usize> = (0..shapes.len())
             .filter(|at| Some(*at) != exclude && wanted(*at))
             .collect();
-        rank_candidates(collection, sources, view, &among, limit)
+        rank_candidates(collection, sources, shape, &among, limit)
     };
     let is_trained = |at: usize| supervision.trained().contains(&shapes[at].ordinal);
     let training = nearest(&|at| shapes[at].pinned, MAX_TRAINING_VOTES)?;
@@ -261,7 +261,7 @@ fn maps_into(
         if let Some(stored) = stored {
             return (stored, None);
         }
-        let new = new_map(&voter.known, shape, model);
+        let new = new_map(sources, &voter.known, shape, model);
         (IncomingMap::from(&new), Some(new))
     });
     Ok(maps.collect())

@@ -5,18 +5,21 @@ use super::{
     state::Vocabulary, supervised,
 };
 use crate::description::{Description, Params};
+use crate::labels::LabelModel;
 use crate::library::change::{Change, LabelEdit};
 use crate::library::error::Result;
 use crate::library::labelling::{Original, Relabelled, cause, new_labels, new_labels_of};
-use crate::library::sources::{Arrays, Known, Sources};
+use crate::library::sources::{ArrayFile, Arrays, FileView, Known, Sources};
 use crate::mesh::Format;
 use crate::mesh::write::off;
-use crate::pipeline::{LabelChange, describe};
+use crate::pipeline::{LabelChange, Prepared, describe};
+use crate::segmentation::Surface;
 use crate::store::{
     CollectionId, CollectionRow, Digest, LabelRow, LabelVersionRow, MapRow, ShapeId, ShapeRow,
 };
 use crate::synth::{Family, Labelled, Options, family};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A shape of a collection in memory.
 #[derive(Clone)]
@@ -41,9 +44,25 @@ impl Sources for Memory {
         let shape = &self.shapes[&id];
         Ok(Known {
             row: shape.row.clone(),
-            arrays: Arrays::Owned(Box::new(shape.description.clone())),
+            arrays: self.arrays(id)?,
             labels: shape.versions.last().expect("labelled").clone(),
         })
+    }
+
+    fn arrays(&self, id: ShapeId) -> Result<ArrayFile> {
+        let shape = &self.shapes[&id];
+        Ok(ArrayFile {
+            arrays: Arrays::Owned(Box::new(shape.description.clone())),
+            digest: shape.row.content_digest,
+        })
+    }
+
+    fn surface(&self, shape: FileView<'_>) -> Arc<Surface> {
+        Arc::new(Surface::new(&shape.view.mesh()))
+    }
+
+    fn prepared(&self, shape: FileView<'_>, model: &LabelModel) -> Arc<Prepared> {
+        Arc::new(Prepared::new(&shape.view, model))
     }
 
     fn version(&self, id: ShapeId) -> Result<u64> {
@@ -62,6 +81,10 @@ impl Sources for Memory {
     fn map(&self, from: ShapeId, to: ShapeId) -> Result<Option<MapRow>> {
         let found = self.maps.iter().find(|m| (m.from, m.to) == (from, to));
         Ok(found.cloned())
+    }
+
+    fn has_map(&self, from: ShapeId, to: ShapeId) -> Result<bool> {
+        Ok(self.maps.iter().any(|m| (m.from, m.to) == (from, to)))
     }
 
     fn maps_into(&self, to: ShapeId) -> Result<Vec<MapRow>> {
@@ -111,11 +134,15 @@ impl Memory {
     fn add(&mut self, collection: &mut Collection, name: &str, description: &Description) {
         let digest = Digest::of(name.as_bytes());
         let new = discovered::NewShape {
-            view: description.view(),
+            arrays: FileView {
+                view: description.view(),
+                file: digest,
+            },
             digest,
         };
-        let nearest = discovered::sources_for(collection, self, &new.view).expect("ranked");
-        let voted = discovered::label_new(collection, self, &new.view, &nearest).expect("labelled");
+        let nearest = discovered::sources_for(collection, self, new.arrays).expect("ranked");
+        let voted =
+            discovered::label_new(collection, self, new.arrays, &nearest).expect("labelled");
         let (labelling, maps) = match voted {
             Some(voted) => (Some(voted.labelling), voted.maps),
             None => (None, Vec::new()),
@@ -126,7 +153,7 @@ impl Memory {
             digest: &digest,
             format: "off",
         };
-        let labels = new_labels(self, &new.view, &plan.labelling, ids, original);
+        let labels = new_labels(self, new.arrays, &plan.labelling, ids, original);
         let labels = labels.expect("finished");
         let (mut labels, epoch) = (labels.row, labels.summary.label_epoch);
         labels.version = 1;

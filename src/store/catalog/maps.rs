@@ -70,6 +70,12 @@ impl Reader<'_> {
         found.map(|row| self.with_confidence(row)).transpose()
     }
 
+    /// Whether there is a map that carries functions on `from` to `to`.
+    pub fn has_map(&self, from: ShapeId, to: ShapeId) -> Result<bool> {
+        let sql = "SELECT EXISTS (SELECT 1 FROM maps WHERE from_shape = ?1 AND to_shape = ?2)";
+        Ok(self.number(sql, [from, to])? > 0)
+    }
+
     fn with_confidence(&self, mut row: MapRow) -> Result<MapRow> {
         let found = self.first(
             &MAP_CONFIDENCE,
