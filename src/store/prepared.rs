@@ -1,7 +1,8 @@
 //! Surfaces and standardised descriptors of stored shapes stay in memory between uses.
 //!
-//! Both follow from an array file, the descriptors also from a standardisation, so an entry is named
-//! by the digests of these and is never out of date. The least recently used entries go first.
+//! Both follow from an array file, the descriptors also from a standardisation, so an entry is
+//! named by the digests of these and is never out of date. The least recently used entries go
+//! first.
 
 use super::Digest;
 use crate::labels::LabelModel;
@@ -10,9 +11,9 @@ use crate::segmentation::{Surface, SurfaceEdge};
 use hashlink::LinkedHashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Bytes of prepared shapes that stay in memory, unless another bound is set: about eighty shapes of
-/// the default 2,500 working faces, which are more than the representatives and training shapes that
-/// vote in a collection.
+/// Bytes of prepared shapes that stay in memory, unless another bound is set: about eighty shapes
+/// of the default 2,500 working faces, which are more than the representatives and training shapes
+/// that vote in a collection.
 pub const DEFAULT_PREPARED_BYTES: usize = 128 << 20;
 
 /// Prepared shapes in memory, of all collections of a library.

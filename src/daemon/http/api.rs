@@ -54,7 +54,7 @@ impl Query<'_> {
     fn text(&self, name: &str) -> Result<String, wire::Error> {
         let found = self.find(name).map(str::to_owned);
         found.ok_or_else(|| {
-            bad(
+            convert::field_error(
                 ErrorReason::FieldMissing,
                 name,
                 format!("{name} is missing"),
@@ -68,13 +68,9 @@ impl Query<'_> {
         };
         text.parse().map_err(|_| {
             let message = format!("{name} is {text:?}, which is no number here");
-            bad(ErrorReason::FieldRange, name, message)
+            convert::field_error(ErrorReason::FieldRange, name, message)
         })
     }
-}
-
-pub(super) fn bad(reason: ErrorReason, field: &str, message: String) -> wire::Error {
-    convert::field_error(reason, field, message)
 }
 
 /// JSON, for which memory is reserved.
@@ -250,7 +246,11 @@ async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
         Some("functions") => PortraitDetail::Functions,
         Some(other) => {
             let message = format!("detail is {other:?}, not proxy, surface or functions");
-            return Err(bad(ErrorReason::FieldRange, "detail", message));
+            return Err(convert::field_error(
+                ErrorReason::FieldRange,
+                "detail",
+                message,
+            ));
         }
     };
     let named = query.0.iter().filter(|(key, _)| key == "shape");
@@ -450,7 +450,11 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
             "n_polygons is {}, but the shape has {n}",
             correction.n_polygons
         );
-        return Err(bad(ErrorReason::LabelCount, "n_polygons", message));
+        return Err(convert::field_error(
+            ErrorReason::LabelCount,
+            "n_polygons",
+            message,
+        ));
     }
     // The labels, and the frame they are copied to.
     let needed = n * size_of::<i32>() as u64;
@@ -467,7 +471,9 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
         .hands
         .work(expand)
         .await?
-        .map_err(|message: String| bad(ErrorReason::FieldRange, "runs", message))?;
+        .map_err(|message: String| {
+            convert::field_error(ErrorReason::FieldRange, "runs", message)
+        })?;
     held.shrink_to(needed);
     let frames = Reserved {
         value: frames,

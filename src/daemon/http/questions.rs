@@ -1,6 +1,5 @@
 //! What the viewer sends and shows of questions, answers and verdicts.
 
-use super::api::bad;
 use crate::ipc::convert;
 use crate::ipc::frames::FrameReader;
 use crate::ipc::json;
@@ -39,7 +38,11 @@ impl AnswerBody {
         let answer = given.pop().filter(|_| given.is_empty());
         if answer.is_none() {
             let message = "one of label, named, skip and cut_wrongly is needed".to_owned();
-            return Err(bad(ErrorReason::FieldMissing, "label", message));
+            return Err(convert::field_error(
+                ErrorReason::FieldMissing,
+                "label",
+                message,
+            ));
         }
         Ok(wire::AnswerQuestionRequest {
             collection: self.collection,
@@ -70,7 +73,11 @@ impl ReviewBody {
             "doubtful" => wire::ReviewState::Doubtful,
             other => {
                 let message = format!("state is {other:?}, not approved or doubtful");
-                return Err(bad(ErrorReason::FieldRange, "state", message));
+                return Err(convert::field_error(
+                    ErrorReason::FieldRange,
+                    "state",
+                    message,
+                ));
             }
         };
         Ok(wire::ReviewShapeRequest {
