@@ -104,9 +104,12 @@ impl Answer {
 /// Why parts are passed over, as it is stored: skipped, cut wrongly.
 const PASSED: [&str; 2] = ["skip", "cut"];
 
+/// A shape and the bits of the up axis along which its parts were made.
+type PartsKey = (ShapeId, [u64; 3]);
+
 /// The parts of shapes that were asked about lately, so that the next question is quick.
 #[derive(Debug, Default)]
-pub(super) struct RememberedParts(Mutex<HashMap<(ShapeId, [u64; 3]), Arc<ShapeParts>>>);
+pub(super) struct RememberedParts(Mutex<HashMap<PartsKey, Arc<ShapeParts>>>);
 
 impl RememberedParts {
     /// The parts of a shape, computed if they are not remembered.

@@ -180,14 +180,17 @@ fn approving_makes_the_present_labels_a_persons_and_is_undone_to_the_byte() {
         let names = found.unwrap().into_iter().map(|s| s.name);
         names.collect::<Vec<String>>()
     };
-    assert_eq!(in_state(ReviewState::Approved), [name.clone()]);
+    assert_eq!(in_state(ReviewState::Approved), std::slice::from_ref(&name));
     assert_eq!(in_state(ReviewState::Unseen).len(), 4);
     let undone = library.undo(COLLECTION, None).unwrap();
     assert_eq!(
         (undone.change.as_str(), &undone.subject),
         ("approve", &name)
     );
-    assert_eq!(in_state(ReviewState::Corrected), [name.clone()]);
+    assert_eq!(
+        in_state(ReviewState::Corrected),
+        std::slice::from_ref(&name)
+    );
     library.undo(COLLECTION, None).unwrap();
     assert_eq!(in_state(ReviewState::Unseen).len(), 5);
     assert_eq!(all_labels(&library), before);
