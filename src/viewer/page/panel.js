@@ -195,9 +195,9 @@ class Panel {
     this.choices = all;
     const entry = (label, text) => {
       const at = all.indexOf(label);
-      const key = at < 9 ? make("kbd", {}, String(at + 1)) : null;
-      const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label },
-        key, swatch(this.app.colour(label)), text);
+      const key = at < 9 ? { "data-key": at + 1 } : {};
+      const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label, ...key },
+        swatch(this.app.colour(label)), text);
       button.onclick = () => choose(label);
       return button;
     };
