@@ -71,7 +71,7 @@ pub(crate) struct Approve {
     pub(crate) doubtful: bool,
     #[command(flatten)]
     pub(crate) person: Person,
-    /// Return when the verdict is durable, not when it is carried to the other shapes
+    /// Return once the verdict is durable, before it has been propagated to the other shapes
     #[arg(long)]
     pub(crate) no_wait: bool,
 }

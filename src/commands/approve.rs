@@ -37,9 +37,13 @@ pub(crate) fn run(args: &Approve, mut session: Session) -> Outcome {
     } else if args.doubtful {
         eprintln!("{} is doubtful", args.shape);
     } else {
-        let carried = if waits { "carried" } else { "to be carried" };
+        let propagated = if waits {
+            "propagated"
+        } else {
+            "to be propagated"
+        };
         let n = corrected.n_stale;
-        eprintln!("{} is approved; {carried} to {n} shapes", args.shape);
+        eprintln!("{} is approved; {propagated} to {n} shapes", args.shape);
     }
     Ok(true)
 }

@@ -1,5 +1,5 @@
-//! Asks a person for the label of one part at a time, the part whose answer is worth most, and takes
-//! the answers.
+//! Asks a person for the label of one part at a time, the part whose answer is worth most, and
+//! takes the answers.
 
 use super::change::{LabelEdit, Undoable};
 use super::collection::Collection;
@@ -152,9 +152,9 @@ struct Found<'a> {
 
 impl Library {
     /// The part whose label is worth most to ask a person for, as
-    /// [`next_question`](crate::pipeline::next_question) ranks them. It depends on the shapes and on
-    /// what persons have labelled, not on how far that is propagated. With `passed`, parts that were
-    /// passed over may be asked about again.
+    /// [`next_question`](crate::pipeline::next_question) ranks them. It depends on the shapes and
+    /// on what persons have labelled, not on how far that is propagated. With `passed`, parts that
+    /// were passed over may be asked about again.
     ///
     /// # Errors
     /// There is no such collection, or every part of it was answered or passed over.

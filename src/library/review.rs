@@ -1,4 +1,5 @@
-//! A person's verdict on a shape: its labels were corrected, are right as they are, or are doubtful.
+//! A person's verdict on a shape: its labels were corrected, are right as they are, or are
+//! doubtful.
 
 use super::change::{Change, Undoable, commit_once};
 use super::correct::{Corrected, Correction, corrects};

@@ -1,12 +1,15 @@
-//! Parts of a collection's shapes, some labelled by a person, become the part whose label is worth most to ask for.
+//! Parts of a collection's shapes, some labelled by a person, become the part whose label is worth
+//! most to ask for.
 //!
-//! A part is what is left when a shape's patches are merged until [`N_PARTS`] remain. Parts are compared by their mean
-//! descriptors, in the metric of the scatter within discovered labels. An answer is expected to decide the parts that
-//! are like the one asked for, as far as they are in doubt and no earlier answer is as near: greedy facility location
-//! (Nemhauser, Wolsey and Fisher 1978, *An Analysis of Approximations for Maximizing Submodular Set Functions*), weighted
-//! by area and doubt. A part whose patches seem to have different labels is worth less, because its answer is wrong for
-//! some of them. All this comes from a model of patches alone, so that the next question does not wait until an answer
-//! has been propagated to faces, and is the same whether it has or not.
+//! A part is what is left when a shape's patches are merged until [`N_PARTS`] remain. Parts are
+//! compared by their mean descriptors, in the metric of the scatter within discovered labels. An
+//! answer is expected to decide the parts that are like the one asked for, as far as they are in
+//! doubt and no earlier answer is as near: greedy facility location (Nemhauser, Wolsey and Fisher
+//! 1978, *An Analysis of Approximations for Maximizing Submodular Set Functions*), weighted by area
+//! and doubt. A part whose patches seem to have different labels is worth less, because its answer
+//! is wrong for some of them. All this comes from a model of patches alone, so that the next
+//! question does not wait until an answer has been propagated to faces, and is the same whether it
+//! has or not.
 
 use super::DescriptionView;
 use crate::labels::{Features, Normalisation, Statistics};
@@ -25,7 +28,8 @@ const WORTH_OF_CERTAIN: f64 = 0.1;
 const PRIOR_SHAPES: f64 = 2.0;
 /// Temperature of both classifiers, which are fitted on little.
 const TEMPERATURE: f64 = 2.0;
-/// Share of a shape's area that must be answered of a discovered label until that is known as much as unknown.
+/// Share of a shape's area that must be answered of a discovered label until that is known as much
+/// as unknown.
 const UNSEEN_AREA: f64 = 0.02;
 /// Least probability that counts, as one source must not veto what the other says.
 const FLOOR: f64 = 0.02;
@@ -48,8 +52,9 @@ pub struct ShapeParts {
 }
 
 impl ShapeParts {
-    /// The parts of a shape; `up` is the collection's up axis, if it is known. Patches are merged by descriptors that are
-    /// standardised over the shape itself, so that its parts do not depend on other shapes.
+    /// The parts of a shape; `up` is the collection's up axis, if it is known. Patches are merged
+    /// by descriptors that are standardised over the shape itself, so that its parts do not depend
+    /// on other shapes.
     pub fn new(shape: &DescriptionView<'_>, up: Option<[f64; 3]>) -> Self {
         let surface = Surface::new(&shape.mesh());
         let raw = Features::raw(shape, up);
@@ -113,12 +118,13 @@ pub struct Question {
     pub gain: f64,
     /// Probability that its likeliest class is wrong.
     pub doubt: f64,
-    /// The likeliest classes with their probabilities: below k those of the person, from k on discovered labels that
-    /// nobody has given a meaning.
+    /// The likeliest classes with their probabilities: below k those of the person, from k on
+    /// discovered labels that nobody has given a meaning.
     pub likeliest: Vec<(usize, f64)>,
 }
 
-/// The part whose answer is worth most; `None` if none is open. Costs the square of the number of parts.
+/// The part whose answer is worth most; `None` if none is open. Costs the square of the number of
+/// parts.
 pub fn next_question(shapes: &[AskedShape<'_>], known: &Background<'_>) -> Option<Question> {
     if !shapes.iter().any(|s| s.open.contains(&true)) {
         return None;
@@ -168,12 +174,13 @@ struct PartModel {
     dim: usize,
     /// Mean probability over the patches that the likeliest class of a person is wrong.
     doubt: Vec<f64>,
-    /// Share of the area whose patches have the label of most, on average of the discovered labels and the person's.
+    /// Share of the area whose patches have the label of most, on average of the discovered labels
+    /// and the person's.
     purity: Vec<f64>,
     /// Columns of `probabilities`.
     width: usize,
-    /// Mean probabilities over the patches `(n_parts, k + n)`: the person's classes, and discovered labels as far as
-    /// nobody has named them.
+    /// Mean probabilities over the patches `(n_parts, k + n)`: the person's classes, and discovered
+    /// labels as far as nobody has named them.
     probabilities: Vec<f64>,
 }
 
@@ -248,8 +255,9 @@ impl PartModel {
         classes
     }
 
-    /// Likeness of every two parts `(n, n)`, 0 to 1: `exp(−d²/h)`, d the distance of their means in the metric of the
-    /// scatter within discovered labels, h the median of d² to a near part of another shape.
+    /// Likeness of every two parts `(n, n)`, 0 to 1: `exp(−d²/h)`, d the distance of their means in
+    /// the metric of the scatter within discovered labels, h the median of d² to a near part of
+    /// another shape.
     fn kernel(&self, discovered: &Statistics) -> DMatrix<f64> {
         let (n, dim) = (self.area.len(), self.dim);
         let scatter = discovered.scatter_within();
@@ -333,7 +341,8 @@ impl Patches {
         }
     }
 
-    /// Share of the area of some patches that has the label of most, on average of discovered labels and the person's.
+    /// Share of the area of some patches that has the label of most, on average of discovered
+    /// labels and the person's.
     fn purity(&self, members: &[(usize, f64)], k: usize) -> f64 {
         let share = |label: &dyn Fn(usize) -> usize| {
             let mut area = vec![0.0; self.width];
@@ -358,7 +367,8 @@ fn largest(row: &[f64]) -> usize {
     (0..row.len()).max_by(order).unwrap_or(0)
 }
 
-/// Area that a person gave to each class in each patch `(n_patches, k)`: what a part has, spread over its patches.
+/// Area that a person gave to each class in each patch `(n_patches, k)`: what a part has, spread
+/// over its patches.
 fn labelled_patches(shapes: &[AskedShape<'_>], k: usize) -> Vec<f64> {
     let mut out = Vec::new();
     for shape in shapes {
@@ -380,7 +390,8 @@ fn labelled_patches(shapes: &[AskedShape<'_>], k: usize) -> Vec<f64> {
     out
 }
 
-/// What each discovered label means `(n, k + 1)`: probabilities of the person's classes, and that nobody has named it.
+/// What each discovered label means `(n, k + 1)`: probabilities of the person's classes, and that
+/// nobody has named it.
 fn meaning(labelled: &[f64], found: &[f64], (k, n): (usize, usize)) -> Vec<f64> {
     let mut both = vec![0.0; n * (k + 1)];
     if k > 0 {
@@ -400,7 +411,8 @@ fn meaning(labelled: &[f64], found: &[f64], (k, n): (usize, usize)) -> Vec<f64> 
     both
 }
 
-/// Statistics of the person's classes: the labelled patches, and the discovered labels by their meaning as a prior.
+/// Statistics of the person's classes: the labelled patches, and the discovered labels by their
+/// meaning as a prior.
 fn person_statistics(
     labelled: &[f64],
     features: &Features,

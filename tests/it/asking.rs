@@ -6,7 +6,7 @@ use coseg::library::{Answer, Correction, PartQuestion, Reason, ReviewState, Up};
 use coseg::synth::{Family, Labelled, family};
 use std::collections::{BTreeMap, BTreeSet};
 
-fn carry(library: &Library) {
+fn propagate(library: &Library) {
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
 }
 
@@ -66,7 +66,7 @@ fn answers_pin_parts_and_name_labels_that_are_then_offered() {
         let found = labels.iter().find(|l| l.id == *id).unwrap();
         assert_eq!(found.name, Some(format!("part {part}")));
     }
-    carry(&library);
+    propagate(&library);
     let offered = ask(&library).likeliest;
     assert!(
         offered
@@ -94,7 +94,7 @@ fn the_next_question_does_not_wait_for_propagation() {
     let first = ask(&library);
     answer(&library, &first, &Answer::Named("handle".into()));
     let at_once = ask(&library);
-    carry(&library);
+    propagate(&library);
     let later = ask(&library);
     assert_eq!((&at_once.shape, at_once.part), (&later.shape, later.part));
 }
@@ -158,7 +158,7 @@ fn approving_makes_the_present_labels_a_persons_and_is_undone_to_the_byte() {
         label: 40,
     };
     library.correct(COLLECTION, &name, &painted, None).unwrap();
-    carry(&library);
+    propagate(&library);
     let present = all_labels(&library)[&name].clone();
     let done = library.approve(COLLECTION, &name, "ada", None).unwrap();
     assert_eq!(done.n_faces as usize, present.len());
@@ -170,7 +170,7 @@ fn approving_makes_the_present_labels_a_persons_and_is_undone_to_the_byte() {
         (ReviewState::Approved, "ada")
     );
     assert!(shape.review.unix_ms > 1_600_000_000_000);
-    carry(&library);
+    propagate(&library);
     assert_eq!(all_labels(&library)[&name], present, "pinned");
 
     drop(library);
