@@ -25,7 +25,7 @@ const address = (page) => page.evaluate(() => location.hash);
 /** What can have the focus and can be seen, named; and what of it had it after each Tab, and how that showed. */
 const focusable = (page) =>
   page.evaluate(() => {
-    const all = [...document.querySelectorAll("button, select, input, canvas[tabindex]")];
+    const all = [...document.querySelectorAll("button, select, input, canvas[tabindex], aside[tabindex]")];
     const there = all.filter((e) => !e.disabled && e.tabIndex >= 0 && e.checkVisibility());
     there.forEach((e, i) => (e.dataset.seen ??= `${e.id || e.dataset.name || e.textContent.trim() || e.tagName} ${i}`));
     return there.map((e) => e.dataset.seen);

@@ -281,18 +281,24 @@ if (what === "many") {
     await shot(page, "question");
     const offered = await page.$$eval(".palette [data-answer]", (all) => all.length);
     assert.ok(offered >= 1 && offered <= 3, await question());
+    // Answers by a key, and waits for another question.
+    const answer = async (key) => {
+      const was = await page.$eval("#controls", (c) => c.dataset.question);
+      await page.keyboard.press(key);
+      await page.waitForFunction((was) => document.querySelector("#controls").dataset.question !== was, was);
+    };
     await page.keyboard.press("n");
     await page.keyboard.type("seat");
-    await page.keyboard.press("Enter");
-    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("1 answered"));
+    await answer("Enter");
+    assert.match(await question(), /1 answered/);
     const seat = coseg("show", "--collection", "chairs").labels.find((l) => l.name === "seat").id;
     assert.ok(coseg("labels", asked, "--collection", "chairs", "--no-wait").labels.includes(seat));
     const inState = (state) => coseg("ls", "chairs", "--review", state).shapes.map((s) => s.name);
     assert.deepEqual(inState("corrected"), [asked]);
-    await page.keyboard.press("s");
-    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("1 answered"));
-    await page.keyboard.press("1");
-    await page.waitForFunction(() => document.querySelector("#controls").textContent.includes("2 answered"));
+    await answer("s");
+    assert.match(await question(), /1 answered/);
+    await answer("1");
+    assert.match(await question(), /2 answered/);
     await page.waitForSelector("#effect:not([hidden])");
     for (const [keys, word, n] of [["Control+z", "Undone: answer", 1], ["Control+Shift+z", "Done again: answer", 2],
       ["Control+z", "Undone: answer", 1], ["Control+z", "Undone: answer", 0]]) {

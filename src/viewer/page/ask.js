@@ -23,9 +23,8 @@ class Asker {
       app.stage.colour();
       app.stage.draw();
       app.panel.showControls();
-      return;
-    }
-    await app.go({ shape: question.shape, view: "ask", detail: null });
+    } else await app.go({ shape: question.shape, view: "ask", detail: null });
+    $("controls").dataset.question = `${question.shape}:${question.part}`;
   }
 
   /** Sends an answer and asks on: `{label}`, `{named}`, `{skip}` or `{cut_wrongly}`. */
@@ -39,10 +38,11 @@ class Asker {
         if (answer.skip || answer.cut_wrongly) await app.source.change("answer", body);
         else await app.changes.send("answer", body);
         await this.next();
-        await app.reload();
       } finally {
         this.busy = false;
       }
+      // The next question can be answered meanwhile.
+      await app.reload();
     });
   }
 

@@ -102,14 +102,18 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
             .execute_batch(sql)
             .expect("runs");
     };
-    old("DROP TABLE point_maps; DROP TABLE map_confidence; PRAGMA user_version = 2");
+    let since_4 = "DROP TABLE reviews; DROP TABLE passed_parts;";
+    let since_3 = "DROP TABLE point_maps; DROP TABLE map_confidence;";
+    let since_2 = "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;";
+    old(&format!("{since_4} PRAGMA user_version = 3"));
     drop(Store::open(&library)?);
-    assert_eq!(format(), 3);
-    old("DROP TABLE point_maps; DROP TABLE map_confidence;
-         DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;
-         PRAGMA user_version = 1");
+    assert_eq!(format(), 4);
+    old(&format!("{since_4} {since_3} PRAGMA user_version = 2"));
+    drop(Store::open(&library)?);
+    assert_eq!(format(), 4);
+    old(&format!("{since_4} {since_3} {since_2} PRAGMA user_version = 1"));
     let store = Store::open(&library)?;
-    assert_eq!(format(), 3);
+    assert_eq!(format(), 4);
     let new = coseg::store::NewCollection {
         name: "old".into(),
         ..Default::default()
@@ -133,20 +137,20 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 4");
+    change("PRAGMA user_version = 5");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 4,
-                supported: 3,
+                found: 5,
+                supported: 4,
                 ..
             }
         ),
         "{newer}"
     );
-    change("PRAGMA user_version = 3; PRAGMA application_id = 7");
+    change("PRAGMA user_version = 4; PRAGMA application_id = 7");
     assert!(Store::open(&library).err().expect("refused").is_damage());
     let other = dir.path().join("other");
     std::fs::create_dir(&other).expect("created");
