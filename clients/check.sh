@@ -51,7 +51,7 @@ build_sdist(sys.argv[1])' "$WORK/archive" >/dev/null)
     # The archive holds the workspace that it is built from: here only its manifests are read, and
     # what cargo has built already is taken.
     tar -x -C "$WORK/archive" -f "$WORK"/archive/*.tar.gz
-    (cd "$WORK"/archive/coseg-*/workspace && cargo metadata --locked --format-version 1 >/dev/null)
+    (cd "$WORK"/archive/coseg-*/workspace && cargo metadata --no-deps --offline --format-version 1 >/dev/null)
     for package in "$WORK"/archive/*.tar.gz "$WORK"/wheel/*.whl; do
         bin/python -m pip install -q --force-reinstall "$package"
         # Nothing of Rust is on the path.
