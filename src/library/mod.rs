@@ -63,6 +63,7 @@ mod submit;
 mod suggest;
 mod types;
 mod upright;
+mod verdict;
 mod voting;
 
 pub use advance::MAX_BATCH;
@@ -80,7 +81,6 @@ pub use questions::{Answer, Answered, OfferedLabel, PartQuestion};
 pub use reason::{Code, Reason};
 pub use remote::{PlacementTicket, state_from_json, state_to_json};
 pub use repair::Repaired;
-pub use review::{Review, ReviewState};
 pub use rows::report_to_json;
 pub use submit::{Described, Describer, StoredOriginals, Submission};
 pub use suggest::Suggestion;
@@ -91,3 +91,4 @@ pub use types::{
     UpEstimate,
 };
 pub use upright::UpSet;
+pub use verdict::{Review, ReviewState};

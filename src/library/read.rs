@@ -4,7 +4,7 @@ use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
 use super::labelling::face_ids;
 use super::lookup::{object_length, require_collection};
-use super::review::{Review, ReviewState};
+use super::review::review_of_row;
 use super::rows::{
     confidence_of_row, damaged, format_from_name, from_json, quality_from_json, report_from_json,
 };
@@ -12,6 +12,7 @@ use super::sources::{Sources, mapped_shape};
 use super::types::{
     Event, EventKind, LabelId, Labels, LibraryStats, MapInfo, PartMatch, ShapeInfo,
 };
+use super::verdict::{Review, ReviewState};
 use super::voting::PreparedShape;
 use crate::correspondence::{overlaps, part_of_vertex, parts};
 use crate::fmap::Quality;
@@ -66,7 +67,7 @@ impl Library {
             let pinned = r.pinned_shapes(id)?;
             let info = |row: ShapeRow| {
                 let is_pinned = pinned.binary_search(&row.id).is_ok();
-                let review = Review::of_row(reviews.remove(&row.id), is_pinned)?;
+                let review = review_of_row(reviews.remove(&row.id), is_pinned)?;
                 shape_info(row, review)
             };
             rows.into_iter().map(info).collect()
@@ -81,7 +82,7 @@ impl Library {
         let row = self.shape_row(collection, shape)?.1;
         self.store.catalog().read(|r| {
             let is_pinned = r.pins(row.id)?.is_some();
-            let review = Review::of_row(r.review(row.id)?, is_pinned)?;
+            let review = review_of_row(r.review(row.id)?, is_pinned)?;
             shape_info(row, review)
         })
     }

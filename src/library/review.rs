@@ -1,5 +1,4 @@
-//! A person's verdict on a shape: its labels were corrected, are right as they are, or are
-//! doubtful.
+//! Stores a person's verdict on a shape, and reads it back.
 
 use super::change::{Change, Undoable, commit_once};
 use super::correct::{Corrected, Correction, corrects};
@@ -10,84 +9,32 @@ use super::once::{Request, answered, from_reply, unix_ms};
 use super::rows::{damaged, to_json};
 use super::sources::Sources;
 use super::types::RequestKey;
+use super::verdict::{Review, ReviewState};
 use crate::store::ReviewRow;
-use serde::{Deserialize, Serialize};
 
 /// Most bytes of a person's name.
 const MAX_REVIEWER: usize = 128;
 
-/// A person's verdict on the labels of a shape.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ReviewState {
-    /// Nobody has given a verdict.
-    Unseen,
-    /// A person labelled some of its faces.
-    Corrected,
-    /// A person found all its labels right.
-    Approved,
-    /// A person found something wrong that is still there.
-    Doubtful,
-}
-
-impl ReviewState {
-    /// All of them, in the order in which work proceeds.
-    pub const ALL: [Self; 4] = [
-        Self::Unseen,
-        Self::Corrected,
-        Self::Approved,
-        Self::Doubtful,
-    ];
-
-    /// The stored name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Unseen => "unseen",
-            Self::Corrected => "corrected",
-            Self::Approved => "approved",
-            Self::Doubtful => "doubtful",
-        }
-    }
-
-    /// The state of this name.
-    pub fn of_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|s| s.name() == name)
-    }
-}
-
-/// A verdict with who gave it and when.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Review {
-    /// The verdict.
-    pub state: ReviewState,
-    /// Who gave it, as the person said; may be empty.
-    pub by: String,
-    /// When, in milliseconds since 1970; 0: unknown.
-    pub unix_ms: u64,
-}
-
-impl Review {
-    /// The review that a row says, or its absence: before reviews were stored, pins alone said that
-    /// a shape was corrected.
-    pub(super) fn of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Self> {
-        let Some(row) = row else {
-            return Ok(Self {
-                state: match pinned {
-                    true => ReviewState::Corrected,
-                    false => ReviewState::Unseen,
-                },
-                by: String::new(),
-                unix_ms: 0,
-            });
-        };
-        let state = ReviewState::of_name(&row.state);
-        let unknown = || damaged("reviews", &format!("{:?} is not a state", row.state));
-        Ok(Self {
-            state: state.ok_or_else(unknown)?,
-            by: row.reviewer,
-            unix_ms: row.unix_ms,
-        })
-    }
+/// The review that a row says, or its absence: before reviews were stored, pins alone said that a
+/// shape was corrected.
+pub(super) fn review_of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Review> {
+    let Some(row) = row else {
+        return Ok(Review {
+            state: match pinned {
+                true => ReviewState::Corrected,
+                false => ReviewState::Unseen,
+            },
+            by: String::new(),
+            unix_ms: 0,
+        });
+    };
+    let state = ReviewState::of_name(&row.state);
+    let unknown = || damaged("reviews", &format!("{:?} is not a state", row.state));
+    Ok(Review {
+        state: state.ok_or_else(unknown)?,
+        by: row.reviewer,
+        unix_ms: row.unix_ms,
+    })
 }
 
 /// Refuses what cannot be a person's name. It may be empty.
@@ -170,7 +117,7 @@ impl Library {
                 })?;
             }
             let found = self.store.catalog().read(|r| r.review(id))?;
-            Review::of_row(found, false)
+            review_of_row(found, false)
         })
     }
 }
@@ -189,7 +136,7 @@ mod tests {
 
     #[test]
     fn shapes_that_an_earlier_version_corrected_count_as_corrected() {
-        let state = |row, pinned| Review::of_row(row, pinned).map(|r| r.state);
+        let state = |row, pinned| review_of_row(row, pinned).map(|r| r.state);
         assert_eq!(state(None, false).unwrap(), ReviewState::Unseen);
         assert_eq!(state(None, true).unwrap(), ReviewState::Corrected);
         let row = review_row(ReviewState::Approved, "ada");

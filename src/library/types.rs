@@ -1,7 +1,7 @@
 //! The values that the library takes and returns: collections, shapes, labels, jobs, events.
 
 use super::reason::{Code, Reason};
-use super::review::Review;
+use super::verdict::Review;
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use serde::{Deserialize, Serialize};

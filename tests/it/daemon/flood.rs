@@ -4,7 +4,7 @@
 
 use crate::harness::{Daemon, Home, add, skittle};
 use coseg::call;
-use coseg::ipc::client::Client;
+use coseg::ipc::client::{Client, ClientError};
 use coseg::ipc::wire::{self, Request, request::Body};
 use prost::Message as _;
 use std::collections::VecDeque;
@@ -77,8 +77,18 @@ fn peak(daemon: &Daemon) -> u64 {
     kilobytes.parse::<u64>().unwrap() << 10
 }
 
+/// The daemon's counters. A busy daemon refuses for a moment, which a good client accepts.
 fn stats(client: &mut Client) -> wire::StatsReply {
-    call!(client, Stats(wire::StatsRequest {})).unwrap()
+    let begin = Instant::now();
+    loop {
+        match call!(client, Stats(wire::StatsRequest {})) {
+            Ok(stats) => return stats,
+            Err(ClientError::Refused(e)) if e.retry_after_ms > 0 && begin.elapsed() < PATIENCE => {
+                std::thread::sleep(Duration::from_millis(e.retry_after_ms));
+            }
+            Err(e) => panic!("{e}"),
+        }
+    }
 }
 
 /// The 99th percentile of the response times for a well-behaved client while `work` runs.

@@ -111,7 +111,9 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
     old(&format!("{since_4} {since_3} PRAGMA user_version = 2"));
     drop(Store::open(&library)?);
     assert_eq!(format(), 4);
-    old(&format!("{since_4} {since_3} {since_2} PRAGMA user_version = 1"));
+    old(&format!(
+        "{since_4} {since_3} {since_2} PRAGMA user_version = 1"
+    ));
     let store = Store::open(&library)?;
     assert_eq!(format(), 4);
     let new = coseg::store::NewCollection {
