@@ -10,7 +10,7 @@ use super::labelling::{NewLabels, Relabelled, area_shares, cause, face_ids};
 use super::once::{Request, answered, from_reply};
 use super::pins::{Instead, UsedLabels, pin_polygons, pinned_faces, pinned_share, used_labels};
 use super::reason::Reason;
-use super::review::{check_reviewer, review_row};
+use super::review_rows::{check_reviewer, review_row};
 use super::rows::to_json;
 use super::sources::{Known, Sources};
 use super::types::{EventKind, FailureSubject, LabelId, PartInfo, RequestKey};

@@ -4,7 +4,7 @@
 use super::collection::Collection;
 use super::error::{LibraryError, Named, Result};
 use super::lookup::{require_collection, require_shape};
-use super::questions::RememberedParts;
+use super::remembered::RememberedParts;
 use super::types::Placed;
 use crate::store::check::Finding;
 use crate::store::snapshot::Snapshot;

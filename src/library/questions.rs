@@ -10,7 +10,7 @@ use super::names::check_name;
 use super::once::{Request, answered, from_reply};
 use super::pins::pins_of;
 use super::reason::Reason;
-use super::review::{check_reviewer, review_row};
+use super::review_rows::{check_reviewer, review_row};
 use super::rows::{label_colour, to_json};
 use super::sources::Sources;
 use super::types::{LabelId, RequestKey};
@@ -21,16 +21,14 @@ use crate::pipeline::{AskedShape, Background, Question, ShapeParts, next_questio
 use crate::store::{LabelRow, PassedPart, ShapeId};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// Most shapes among whose parts the next question is chosen, besides those with answers: the cost
 /// grows with the square.
 const MAX_ASKED: usize = 100;
 /// Most shapes with answers that are looked at, those with the least digests.
 const MAX_ANSWERED: usize = 60;
-/// Shapes whose parts are remembered: about 30 KB each.
-const MAX_REMEMBERED: usize = 512;
 /// Most bytes of a label's name.
 const MAX_LABEL_NAME: usize = 128;
 
@@ -104,36 +102,6 @@ impl Answer {
 
 /// Why parts are passed over, as it is stored: skipped, cut wrongly.
 const PASSED: [&str; 2] = ["skip", "cut"];
-
-/// A shape and the bits of the up axis along which its parts were made.
-type PartsKey = (ShapeId, [u64; 3]);
-
-/// The parts of shapes that were asked about lately, so that the next question is quick.
-#[derive(Debug, Default)]
-pub(super) struct RememberedParts(Mutex<HashMap<PartsKey, Arc<ShapeParts>>>);
-
-impl RememberedParts {
-    /// The parts of a shape, computed if they are not remembered.
-    fn of(
-        &self,
-        sources: &dyn Sources,
-        id: ShapeId,
-        up: Option<[f64; 3]>,
-    ) -> Result<Arc<ShapeParts>> {
-        let key = (id, up.unwrap_or_default().map(f64::to_bits));
-        let lock = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(parts) = lock().get(&key) {
-            return Ok(Arc::clone(parts));
-        }
-        let parts = Arc::new(ShapeParts::new(&sources.known(id)?.view(), up));
-        let mut all = lock();
-        if all.len() >= MAX_REMEMBERED {
-            all.clear();
-        }
-        all.insert(key, Arc::clone(&parts));
-        Ok(parts)
-    }
-}
 
 /// A shape among whose parts the next question is chosen.
 struct Asked {

@@ -4,7 +4,7 @@ use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
 use super::labelling::face_ids;
 use super::lookup::{object_length, require_collection};
-use super::review::review_of_row;
+use super::review_rows::review_of_row;
 use super::rows::{
     confidence_of_row, damaged, format_from_name, from_json, quality_from_json, report_from_json,
 };

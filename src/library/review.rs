@@ -4,55 +4,12 @@ use super::change::{Change, Undoable, commit_once};
 use super::correct::{Corrected, Correction, corrects};
 use super::error::Result;
 use super::facade::Library;
-use super::names::check_name;
-use super::once::{Request, answered, from_reply, unix_ms};
-use super::rows::{damaged, to_json};
+use super::once::{Request, answered, from_reply};
+use super::review_rows::{check_reviewer, review_of_row, review_row};
+use super::rows::to_json;
 use super::sources::Sources;
 use super::types::RequestKey;
 use super::verdict::{Review, ReviewState};
-use crate::store::ReviewRow;
-
-/// Most bytes of a person's name.
-const MAX_REVIEWER: usize = 128;
-
-/// The review that a row says, or its absence: before reviews were stored, pins alone said that a
-/// shape was corrected.
-pub(super) fn review_of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Review> {
-    let Some(row) = row else {
-        return Ok(Review {
-            state: match pinned {
-                true => ReviewState::Corrected,
-                false => ReviewState::Unseen,
-            },
-            by: String::new(),
-            unix_ms: 0,
-        });
-    };
-    let state = ReviewState::of_name(&row.state);
-    let unknown = || damaged("reviews", &format!("{:?} is not a state", row.state));
-    Ok(Review {
-        state: state.ok_or_else(unknown)?,
-        by: row.reviewer,
-        unix_ms: row.unix_ms,
-    })
-}
-
-/// Refuses what cannot be a person's name. It may be empty.
-pub(super) fn check_reviewer(by: &str) -> Result<()> {
-    match by {
-        "" => Ok(()),
-        by => check_name("person", by, MAX_REVIEWER),
-    }
-}
-
-/// A verdict that is given now.
-pub(super) fn review_row(state: ReviewState, by: &str) -> ReviewRow {
-    ReviewRow {
-        state: state.name().to_owned(),
-        reviewer: by.to_owned(),
-        unix_ms: unix_ms(),
-    }
-}
 
 impl Library {
     /// Takes all present labels of a shape as a person's, who found them right: it becomes a
@@ -125,6 +82,7 @@ impl Library {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::ReviewRow;
 
     #[test]
     fn states_have_names_that_come_back() {
