@@ -239,7 +239,7 @@ def question(reply: question_pb2.NextQuestionReply, raw: Raw) -> t.Question:
         t.Question,
         reply,
         faces=raw.array(reply.faces),
-        likeliest=tuple(flat(t.OfferedLabel, l) for l in reply.likeliest),
+        likeliest=tuple(flat(t.OfferedLabel, label) for label in reply.likeliest),
     )
 
 
