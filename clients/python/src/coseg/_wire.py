@@ -228,7 +228,7 @@ def changed_label(reply: correction_pb2.MergeLabelsReply | correction_pb2.SplitL
     return t.ChangedLabel(**vars(label(reply.label)), n_changed=reply.n_shapes)
 
 
-def review_state(name: str) -> int:
+def review_state(name: str) -> Any:
     """A verdict by its name."""
     return _value(review_pb2.ReviewState, f"REVIEW_STATE_{name.upper()}", f"review is {name!r}")
 
