@@ -444,7 +444,10 @@ export class Collection {
     const request = { collection: this.name, shape: name, part, answer: what, by: options.by ?? "" };
     const [reply] = await this.library.call("answerQuestion", request);
     const { label, corrected } = reply;
-    return { label, corrected: corrected && { ...plain(corrected), jobId: corrected.jobId } };
+    return {
+      ...(label !== undefined && { label }),
+      ...(corrected && { corrected: { ...plain(corrected), jobId: corrected.jobId } }),
+    };
   }
 
   /** Takes all present labels of a shape as a person's; `doubtful` only notes that something is wrong with them. */
