@@ -104,7 +104,7 @@ def test_projection_and_synthesis() -> None:
 
 def test_refusals() -> None:
     mesh = sphere(1)
-    with pytest.raises(coseg.SpectrumError, match="43 eigenpairs asked for") as raised:
+    with pytest.raises(coseg.SpectrumError, match="43 eigenpairs were requested") as raised:
         mesh.spectrum(43)
     assert raised.value.kind == "Count"
     with pytest.raises(coseg.GeometryError, match="operator"):
