@@ -144,7 +144,6 @@ def main() -> int:
             add = [coseg, "add", str(work / "meshes"), "--collection", "chairs", "--parts", "4", "--timeout", "60"]
             subprocess.run(add, env=env, check=True, capture_output=True)
             wait_for("all four are counted", lambda: series("sum(coseg_shapes_finished_total) == 4") == 1)
-            wait_for("rates are there", lambda: series("rate(coseg_replies_total[10s])") == 1)
             questions = []
             for panel in json.loads(DASHBOARD.read_text())["panels"]:
                 for target in panel.get("targets", []):
@@ -152,10 +151,16 @@ def main() -> int:
             questions += [("alert", html.unescape(a), False) for a in alerts()]
             for title, expression, wants_data in questions:
                 filled = expression.replace("$instance", ".*").replace("$__rate_interval", "30s")
-                answer = ask(filled)
-                n = series(filled) if answer["status"] == "success" else -1
                 empty_is_right = not wants_data or any(name in expression for name in MAY_BE_EMPTY)
-                good = n > 0 or (n == 0 and empty_is_right)
+                # A rate exists from the second scrape that has the counter, and one scrape is a second.
+                end = time.monotonic() + 20
+                while True:
+                    answer = ask(filled)
+                    n = series(filled) if answer["status"] == "success" else -1
+                    good = n > 0 or (n == 0 and empty_is_right)
+                    if good or time.monotonic() > end:
+                        break
+                    time.sleep(0.5)
                 print(f"  {'ok' if good else 'FAIL':4} {title}: {n} series: {expression}")
                 if not good:
                     faults.append(f"{title}: {expression}: {answer}")
