@@ -436,9 +436,24 @@ pub(crate) struct Export {
     /// Folder for the files, created if missing
     #[arg(long, short, value_name = "DIR")]
     pub(crate) out: PathBuf,
+    /// Materials of parts, for glb of a glTF and obj of an OBJ
+    #[arg(long, value_name = "WHICH", default_value = "own")]
+    pub(crate) materials: ExportMaterials,
+    /// A subset for each part, such as leg_001, in place of one for each label, for usda
+    #[arg(long)]
+    pub(crate) instances: bool,
     /// Do not wait for queued shapes and relabellings
     #[arg(long)]
     pub(crate) no_wait: bool,
+}
+
+/// Which materials the parts of a file with materials have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ExportMaterials {
+    /// The file's; faces without a material have that of their label
+    Own,
+    /// Those of the labels
+    Labels,
 }
 
 /// The formats of `coseg export`.
@@ -446,13 +461,13 @@ pub(crate) struct Export {
 pub(crate) enum ExportFormat {
     /// NAME.labels.txt: a label for each face of the file, one on each line; -1: unlabelled
     Labels,
-    /// NAME.ply: the mesh with a colour and an int label for each face
+    /// NAME.ply: the mesh with a colour and an int label for each face and vertex
     Ply,
-    /// NAME.obj and labels.mtl: the mesh with a group and a material for each label
+    /// NAME.obj and labels.mtl: the mesh with a group for each part, such as leg.001
     Obj,
-    /// NAME.glb: the mesh with a primitive and a named material for each label
+    /// NAME.glb: the mesh with a node for each part, such as leg.001
     Glb,
-    /// NAME.usda: the mesh with a GeomSubset and a material for each label
+    /// NAME.usda: the mesh with GeomSubsets, primvars and a material for each label
     Usda,
     /// NAME.labels.npy: an int32 for each face of the file
     Npy,

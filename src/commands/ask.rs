@@ -149,7 +149,8 @@ fn draw(
     png: Option<&Path>,
 ) -> Result<(), CommandError> {
     let Some(path) = png else { return Ok(()) };
-    let mesh = export::original_of(session, collection, &question.reply.shape)?;
+    let mesh = export::Original::receive(session, collection, &question.reply.shape)?
+        .any_mesh(&question.reply.shape)?;
     let up = session.describe(collection)?.spec.unwrap_or_default().up();
     let file = |source| CommandError::File {
         path: path.display().to_string(),

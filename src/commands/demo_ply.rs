@@ -1,7 +1,7 @@
 //! Writes labelled shapes as coloured PLY files: one for each shape, and one with all of them side
 //! by side.
 
-use super::export_mesh::colour;
+use super::export_mesh::{colour, styles};
 use coseg::ipc::wire::LabelInfo;
 use coseg::mesh::TriMesh;
 use coseg::mesh::write::ply;
@@ -26,6 +26,7 @@ const SPACING: f64 = 1.15;
 /// the shapes with known parts stand behind those with the found ones.
 pub(super) fn files(shapes: &[(&Labelled, &[i32])], infos: &[LabelInfo]) -> Vec<(String, Vec<u8>)> {
     let mut files = Vec::with_capacity(shapes.len() + 1);
+    let styles = styles(infos);
     let mut all = Scene::default();
     let size = shapes
         .iter()
@@ -33,7 +34,7 @@ pub(super) fn files(shapes: &[(&Labelled, &[i32])], infos: &[LabelInfo]) -> Vec<
         .fold(0.0, f64::max)
         * SPACING;
     for (i, (shape, labels)) in shapes.iter().enumerate() {
-        let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, infos)).collect();
+        let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, &styles)).collect();
         let mesh = &shape.mesh;
         files.push((
             format!("{}.ply", shape.name),
@@ -141,7 +142,7 @@ mod tests {
         let tail = |i: usize| files[i].1[files[i].1.len() - 7..].to_vec();
         assert_eq!(tail(0), [1, 2, 3, 5, 0, 0, 0]);
         assert_eq!(tail(1), [128, 128, 128, 255, 255, 255, 255]);
-        let header = String::from_utf8_lossy(&files[2].1[..200]).into_owned();
+        let header = String::from_utf8_lossy(&files[2].1).into_owned();
         assert!(header.contains("element vertex 12\n") && header.contains("element face 4\n"));
     }
 }

@@ -1,21 +1,25 @@
 //! `coseg export` writes labels, or coloured meshes, of a collection to files.
 
-use super::export_mesh::{colour, material, materials};
+use super::export_mesh::{colour, styles};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
-use crate::cli::{Export, ExportFormat};
+use crate::cli::{Export, ExportFormat, ExportMaterials};
 use coseg::call;
 use coseg::ipc::client::ClientError;
 use coseg::ipc::convert::{format_from_wire, up_from_wire};
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
 use coseg::library::shown;
-use coseg::mesh::write::{glb, mtl, npy, obj, ply, seg, usda};
-use coseg::mesh::{ParsedMesh, parse};
+use coseg::mesh::write::{
+    Labelling, Materials, glb, glb_of_obj, labelled_gltf, labelled_obj, mtl, npy, obj, ply, seg,
+    usda,
+};
+use coseg::mesh::{Format, ParseError, ParsedMesh, parse};
 use coseg::store::Digest;
 use coseg::text::counted;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The name of the material file in exported OBJ files.
@@ -31,7 +35,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         session.wait_until_idle(&collection)?;
     }
     let described = session.describe(&collection)?;
-    let (infos, up) = (&described.labels, up_axis(&described));
+    let (styles, up) = (styles(&described.labels), up_axis(&described));
     let shapes = match args.shapes.as_slice() {
         [] => session
             .shapes(&collection, None)?
@@ -55,15 +59,21 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
             collection: collection.clone(),
             shape: shape.clone(),
             version: 0,
-            confidence: false,
+            confidence: args.format == ExportFormat::Usda,
         };
-        let labels = labels::receive(&mut session, request)?.labels;
-        let (suffix, bytes) = if let Some(found) = without_mesh(args.format, shape, &labels, infos)
-        {
+        let received = labels::receive(&mut session, request)?;
+        let labelling = Labelling {
+            labels: &received.labels,
+            confidence: received.confidence.as_deref(),
+            styles: &styles,
+        };
+        let (suffix, bytes) = if let Some(found) = without_mesh(args.format, shape, &labelling) {
             found
         } else {
-            let mesh = original(&mut session, &collection, shape, labels.len())?;
-            with_mesh(args.format, shape, (&mesh, up), &labels, infos)
+            let original = Original::receive(&mut session, &collection, shape)?;
+            let mesh = original.mesh(shape, labelling.labels.len())?;
+            with_mesh(args, shape, (&original, &mesh, up), &labelling)
+                .map_err(|e| bad_reply(format!("{shape}: {e}")))?
         };
         let stem = file_stem(shape, suffix);
         if stem != *shape {
@@ -75,11 +85,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        let named: Vec<(String, [u8; 3])> = materials(infos)
-            .into_iter()
-            .map(|(_, name, colour)| (name, colour))
-            .collect();
-        write(MATERIALS.to_owned(), mtl(&named).as_bytes())?;
+        write(MATERIALS.to_owned(), mtl(&styles).as_bytes())?;
     }
     progress.finish_and_clear();
     if session.json {
@@ -111,17 +117,17 @@ fn file_stem<'a>(shape: &'a str, suffix: &str) -> Cow<'a, str> {
 fn without_mesh(
     format: ExportFormat,
     shape: &str,
-    labels: &[i32],
-    infos: &[wire::LabelInfo],
+    labelling: &Labelling<'_>,
 ) -> Option<(&'static str, Vec<u8>)> {
+    let labels = labelling.labels;
     Some(match format {
         ExportFormat::Labels => (".labels.txt", seg(labels).into_bytes()),
         ExportFormat::Seg => (".seg", seg(labels).into_bytes()),
         ExportFormat::Npy => (".labels.npy", npy(labels)),
         ExportFormat::Json => {
-            let names: serde_json::Map<String, Value> = materials(infos)
-                .into_iter()
-                .map(|(label, name, _)| (label.to_string(), name.into()))
+            let names = labelling.styles.iter();
+            let names: BTreeMap<String, &str> = names
+                .map(|(label, style)| (label.to_string(), style.name.as_str()))
                 .collect();
             let value = json!({ "shape": shape, "labels": labels, "names": names });
             (".labels.json", value.to_string().into_bytes())
@@ -143,36 +149,52 @@ fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
     up_from_wire(up).axis()
 }
 
-/// Suffix and bytes of a file that contains the mesh, with its up axis, and its labels.
+/// Suffix and bytes of a file that contains the mesh, with its up axis, and its labels. A file in
+/// the format of the original keeps what that holds.
 fn with_mesh(
-    format: ExportFormat,
+    args: &Export,
     shape: &str,
-    (mesh, up): (&ParsedMesh, Option<[f64; 3]>),
-    labels: &[i32],
-    infos: &[wire::LabelInfo],
-) -> (&'static str, Vec<u8>) {
+    (original, mesh, up): (&Original, &ParsedMesh, Option<[f64; 3]>),
+    labelling: &Labelling<'_>,
+) -> Result<(&'static str, Vec<u8>), ParseError> {
     let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
-    let name = |label| material(label, infos);
-    let named = |label| (material(label, infos), colour(label, infos));
-    match format {
-        ExportFormat::Obj => {
-            let text = obj(vertices, &polygons, labels, name, MATERIALS);
+    let bytes = &original.bytes;
+    let materials = match args.materials {
+        ExportMaterials::Own => Materials::Own,
+        ExportMaterials::Labels => Materials::Labels,
+    };
+    Ok(match (args.format, original.format) {
+        (ExportFormat::Obj, Format::Obj) => {
+            let bytes = labelled_obj(bytes, labelling, materials, MATERIALS)?;
+            (".obj", bytes)
+        }
+        (ExportFormat::Obj, _) => {
+            let text = obj(vertices, &polygons, labelling, MATERIALS);
             (".obj", text.into_bytes())
         }
-        ExportFormat::Glb => {
-            let bytes = glb(shape, vertices, &polygons, labels, up, named);
+        (ExportFormat::Glb, Format::Gltf) => {
+            let bytes = labelled_gltf(shape, bytes, labelling, materials, up)?;
             (".glb", bytes)
         }
-        ExportFormat::Usda => {
-            let text = usda(shape, vertices, &polygons, labels, up, named);
+        (ExportFormat::Glb, Format::Obj) => {
+            let bytes = glb_of_obj(shape, bytes, labelling, up)?;
+            (".glb", bytes)
+        }
+        (ExportFormat::Glb, _) => {
+            let bytes = glb(shape, vertices, &polygons, labelling, up);
+            (".glb", bytes)
+        }
+        (ExportFormat::Usda, _) => {
+            let text = usda(shape, vertices, &polygons, labelling, up, args.instances);
             (".usda", text.into_bytes())
         }
         _ => {
-            let colours: Vec<[u8; 3]> = labels.iter().map(|&l| colour(l, infos)).collect();
-            let bytes = ply(vertices, &polygons, &colours, labels);
+            let colour = |label: &i32| colour(*label, labelling.styles);
+            let colours: Vec<[u8; 3]> = labelling.labels.iter().map(colour).collect();
+            let bytes = ply(vertices, &polygons, &colours, labelling.labels);
             (".ply", bytes)
         }
-    }
+    })
 }
 
 fn at(path: &Path, source: std::io::Error) -> CommandError {
@@ -182,42 +204,53 @@ fn at(path: &Path, source: std::io::Error) -> CommandError {
     }
 }
 
-/// The mesh of a shape in its original form.
-pub(super) fn original(
-    session: &mut Session,
-    collection: &str,
-    shape: &str,
-    n_labels: usize,
-) -> Result<ParsedMesh, CommandError> {
-    let mesh = original_of(session, collection, shape)?;
-    if mesh.n_polygons != n_labels {
-        let n = mesh.n_polygons;
-        return Err(CommandError::Client(ClientError::BadReply(format!(
-            "{shape} has {n} faces, but {n_labels} labels by an earlier release: add it again with \
-             --replace"
-        ))));
-    }
-    Ok(mesh)
+fn bad_reply(message: String) -> CommandError {
+    CommandError::Client(ClientError::BadReply(message))
 }
 
-/// The mesh of a shape in its original form, which may have another number of faces than labels.
-pub(super) fn original_of(
-    session: &mut Session,
-    collection: &str,
-    shape: &str,
-) -> Result<ParsedMesh, CommandError> {
-    let request = wire::GetOriginalRequest {
-        collection: collection.to_owned(),
-        shape: shape.to_owned(),
-    };
-    let (reply, frames) = call!(session.client, GetOriginal(request), frames)?;
-    let bad = |message: String| CommandError::Client(ClientError::BadReply(message));
-    let format = format_from_wire(reply.format())
-        .ok_or_else(|| bad("a mesh of unknown format".to_owned()))?;
-    let bytes = FrameReader::new(&frames)
-        .file(reply.bytes.as_ref(), "bytes")
-        .map_err(|e| bad(e.to_string()))?;
-    parse(bytes, format).map_err(|e| bad(format!("{shape}: {e}")))
+/// The file of a shape as it was sent.
+pub(super) struct Original {
+    bytes: Vec<u8>,
+    format: Format,
+}
+
+impl Original {
+    pub(super) fn receive(
+        session: &mut Session,
+        collection: &str,
+        shape: &str,
+    ) -> Result<Self, CommandError> {
+        let request = wire::GetOriginalRequest {
+            collection: collection.to_owned(),
+            shape: shape.to_owned(),
+        };
+        let (reply, frames) = call!(session.client, GetOriginal(request), frames)?;
+        let format = format_from_wire(reply.format());
+        let format = format.ok_or_else(|| bad_reply("a mesh of unknown format".to_owned()))?;
+        let reader = FrameReader::new(&frames);
+        let bytes = reader.file(reply.bytes.as_ref(), "bytes");
+        let bytes = bytes.map_err(|e| bad_reply(e.to_string()))?.to_vec();
+        Ok(Self { bytes, format })
+    }
+
+    /// Its mesh, which may have another number of polygons than labels.
+    pub(super) fn any_mesh(&self, shape: &str) -> Result<ParsedMesh, CommandError> {
+        let mesh = parse(&self.bytes, self.format);
+        mesh.map_err(|e| bad_reply(format!("{shape}: {e}")))
+    }
+
+    /// Its mesh, which has one polygon for each label.
+    pub(super) fn mesh(&self, shape: &str, n_labels: usize) -> Result<ParsedMesh, CommandError> {
+        let mesh = self.any_mesh(shape)?;
+        if mesh.n_polygons != n_labels {
+            let n = mesh.n_polygons;
+            return Err(bad_reply(format!(
+                "{shape} has {n} faces, but {n_labels} labels by an earlier release: add it again \
+                 with --replace"
+            )));
+        }
+        Ok(mesh)
+    }
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ work=$(mktemp -d)
 trap '[ -z "${daemon:-}" ] || kill "$daemon" 2>/dev/null || true; rm -rf "$work"' EXIT
 
 python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install -q numpy trimesh plyfile usd-core
+"$work/venv/bin/pip" install -q numpy trimesh plyfile usd-core pillow
 npm install --silent --no-audit --no-fund --prefix "$work" gltf-validator@latest three@0.170 >/dev/null
 cp "$here"/*.mjs "$work/"
 
@@ -26,7 +26,14 @@ for format in labels seg npy json ply obj glb usda; do
     "$coseg" export --format "$format" --out "$work/out"
 done
 "$work/venv/bin/python" "$here/check.py" "$work/in" "$work/out"
-node "$work/validate.mjs" "$work"/out/*.glb
+node "$work/validate.mjs" "$work/out/parts.json" "$work"/out/*.glb
+# The package is large, so that it is not installed for this; COSEG_BPY names a Python that has it.
+blender=${COSEG_BPY:-python3}
+if "$blender" -c 'import bpy' 2>/dev/null; then
+    "$blender" "$here/blender.py" "$work/out"
+else
+    echo "skipped: reading with Blender needs a Python with bpy, such as COSEG_BPY=venv/bin/python3"
+fi
 
 # Every messy file through the socket, and spoilt ones with their reasons.
 if [ -n "${COSEG_TEST_DATA:-}" ] && [ -d "$COSEG_TEST_DATA/messy" ]; then

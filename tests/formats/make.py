@@ -57,3 +57,29 @@ for outline in (concave, window):
             lines.append("f " + " ".join(str(n + c + 1) for c in (i, j, j + k, i + k)))
     n += 2 * k
 (target / "concave.obj").write_text("\n".join(lines) + "\n")
+
+# What an artist sends: named nodes, texture coordinates, normals and a material with a texture.
+from PIL import Image  # noqa: E402
+
+painted = trimesh.Scene()
+oak = trimesh.visual.material.PBRMaterial(name="oak", baseColorTexture=Image.new("RGB", (4, 4), (150, 90, 40)))
+for name, size, at in (("seat", (2, 0.2, 2), (0, 1, 0)), ("back", (2, 2, 0.2), (0, 2.1, -0.9))):
+    box = trimesh.creation.box(size)
+    outwards = np.sign(box.vertices) / np.sqrt(3)
+    box = trimesh.Trimesh(box.vertices, box.faces, vertex_normals=outwards, process=False)
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, [0, 2]] / 2 + 0.5, material=oak)
+    painted.add_geometry(box, node_name=name, geom_name=f"{name} mesh", transform=trimesh.transformations.translation_matrix(at))
+painted.export(target / "painted.glb", include_normals=True)
+
+text = ["# drawn by hand", "mtllib wood.mtl"]
+n = 0
+for name, low, high in (("seat", (0, 9, 0), (20, 10, 20)), ("back", (0, 10, 0), (20, 30, 1))):
+    text.append(f"o {name}")
+    text += ["v %g %g %g" % tuple(high[k] if i >> k & 1 else low[k] for k in range(3)) for i in range(8)]
+    text += ["vt %g %g" % (i & 1, i >> 1) for i in range(4)]
+    text += [f"vn {x} {y} {z}" for x, y, z in ((0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0))]
+    text += [f"usemtl {'oak' if name == 'seat' else 'pine'}", "s off"]
+    for normal, quad in enumerate([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]):
+        text.append("f " + " ".join(f"{n * 8 + c + 1}/{n * 4 + i + 1}/{n * 6 + normal + 1}" for i, c in enumerate(quad)))
+    n += 1
+(target / "painted-obj.obj").write_text("\n".join(text) + "\n")

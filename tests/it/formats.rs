@@ -2,13 +2,25 @@
 
 use crate::harness::{Home, SKITTLE_FACES, json, messy_files, skittle, stdout};
 use coseg::library::{CollectionSpec, LibraryError, NewShape};
-use coseg::mesh::{Format, ParsedMesh, parse, write};
+use coseg::mesh::write::{self, Labelling};
+use coseg::mesh::{Format, ParsedMesh, parse};
 use coseg::{Library, synth};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 fn read(path: impl AsRef<Path>) -> Vec<u8> {
     let path = path.as_ref();
     std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// Labels that nobody named.
+fn labelling(labels: &[i32]) -> Labelling<'_> {
+    static UNNAMED: BTreeMap<i32, write::LabelStyle> = BTreeMap::new();
+    Labelling {
+        labels,
+        confidence: None,
+        styles: &UNNAMED,
+    }
 }
 
 /// The same skittle in every format, by file name.
@@ -17,11 +29,10 @@ fn in_every_format() -> Vec<(&'static str, Vec<u8>)> {
     let mesh = parse(text.as_bytes(), Format::Off).unwrap();
     let (vertices, faces) = (&mesh.vertices, &mesh.triangles);
     let labels = vec![0; faces.len()];
-    let obj = write::obj(vertices, faces, &labels, |_| "all".to_owned(), "none.mtl");
+    let labelling = labelling(&labels);
+    let obj = write::obj(vertices, faces, &labelling, "none.mtl");
     let ply = write::ply(vertices, faces, &vec![[0; 3]; faces.len()], &labels);
-    let glb = write::glb("g", vertices, faces, &labels, None, |_| {
-        ("all".to_owned(), [0; 3])
-    });
+    let glb = write::glb("g", vertices, faces, &labelling, None);
     let mut stl = vec![0; 80];
     stl.extend_from_slice(&(faces.len() as u32).to_le_bytes());
     for face in faces {
@@ -84,13 +95,7 @@ fn every_format_comes_in_and_goes_out_with_its_labels() {
         });
         let format = Format::from_name(&original.to_string_lossy()).unwrap();
         let whole = parse(&read(original), format).unwrap();
-        for (ending, format) in [(".ply", Format::Ply), (".obj", Format::Obj)] {
-            assert_eq!(
-                parse(&file(ending), format).unwrap(),
-                whole,
-                "{name}{ending}"
-            );
-        }
+        assert_eq!(parse(&file(".ply"), Format::Ply).unwrap(), whole, "{name}");
         // The label is at the end of a face's record.
         let ply = file(".ply");
         let records = &ply[ply.len() - 20 * SKITTLE_FACES..];
@@ -98,55 +103,84 @@ fn every_format_comes_in_and_goes_out_with_its_labels() {
             .chunks(20)
             .map(|r| i32::from_le_bytes(r[16..].try_into().unwrap()));
         assert!(of_records.eq(labels.iter().copied()));
-        let of_obj = labels_of_obj(&String::from_utf8(file(".obj")).unwrap());
-        assert_eq!(of_obj, labels);
-        let found = parse(&file(".glb"), Format::Gltf).unwrap();
-        assert_eq!(labels_of_glb(&file(".glb"), &found, &whole), labels);
+        assert_eq!(labels_of_obj(&file(".obj"), &whole), labels, "{name}");
+        assert_eq!(labels_of_glb(&file(".glb"), &whole), labels, "{name}");
         let usda = String::from_utf8(file(".usda")).unwrap();
         let listed: Vec<String> = labels.iter().map(i32::to_string).collect();
-        let line = format!("int[] primvars:label = [{}] (", listed.join(", "));
+        let line = format!("int[] primvars:coseg:label = [{}] (", listed.join(", "));
         assert!(usda.contains(&line));
     }
 }
 
-/// The labels of faces, by their groups.
-fn labels_of_obj(text: &str) -> Vec<i32> {
-    let mut label = -1;
-    let mut labels = Vec::new();
-    for line in text.lines() {
-        if let Some(name) = line.strip_prefix("usemtl label_") {
-            label = name.parse().unwrap();
-        } else if line.starts_with("f ") {
-            labels.push(label);
-        }
-    }
-    labels
-}
-
-/// The labels of the polygons that a GLB's primitives list; their triangles must equal those of the
-/// original.
-fn labels_of_glb(bytes: &[u8], found: &ParsedMesh, original: &ParsedMesh) -> Vec<i32> {
-    let n_json = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
-    let root: serde_json::Value = serde_json::from_slice(&bytes[20..20 + n_json]).unwrap();
+/// Labels by the comments of the groups that faces are in; the faces must be the original's.
+fn labels_of_obj(bytes: &[u8], original: &ParsedMesh) -> Vec<i32> {
+    let (found, polygons) = (parse(bytes, Format::Obj).unwrap(), original.polygons());
+    assert_eq!(found.vertices, original.vertices);
+    let mut faces = found.polygons().into_iter();
     let mut labels = vec![i32::MIN; original.n_polygons];
-    let mut triangles = found.triangles.iter();
-    for primitive in root["meshes"][0]["primitives"].as_array().unwrap() {
-        let extras = &primitive["extras"];
-        let label = extras["label"].as_i64().unwrap() as i32;
-        let material = primitive["material"].as_u64().unwrap() as usize;
-        assert_eq!(
-            root["materials"][material]["name"],
-            format!("label_{label}")
-        );
-        let runs: Vec<usize> = serde_json::from_value(extras["polygons"].clone()).unwrap();
-        for run in runs.chunks(2) {
-            let polygons = run[0]..run[0] + run[1];
-            labels[polygons.clone()].fill(label);
-            for polygon in polygons {
-                assert_eq!(triangles.next(), Some(&original.triangles[polygon]));
+    let (mut label, mut n_groups) = (i32::MIN, 0);
+    for line in std::str::from_utf8(bytes).unwrap().lines() {
+        n_groups += usize::from(line.starts_with("g "));
+        if let Some(text) = line.strip_prefix("# label ") {
+            label = text.parse().unwrap();
+        }
+        for run in line
+            .strip_prefix("# faces ")
+            .into_iter()
+            .flat_map(|l| l.split(' '))
+        {
+            let (first, last) = run.split_once('-').unwrap_or((run, run));
+            for face in first.parse::<usize>().unwrap()..=last.parse().unwrap() {
+                labels[face] = label;
+                assert_eq!(faces.next().as_ref(), Some(&polygons[face]));
             }
         }
     }
+    assert_eq!(faces.next(), None);
+    assert_eq!(n_groups, instances_of(original, &labels).len());
+    labels
+}
+
+/// The names of the part instances.
+fn instances_of(mesh: &ParsedMesh, labels: &[i32]) -> Vec<String> {
+    let objects = vec![0; labels.len()];
+    let found = coseg::mesh::instances(&mesh.vertices, &mesh.polygons(), labels, &objects);
+    let pairs = found.labels.iter().zip(&found.numbers);
+    pairs
+        .map(|(label, n)| format!("label_{label}.{n:03}"))
+        .collect()
+}
+
+/// Labels by what a GLB's primitives say of the polygons they have; their triangles must be the
+/// original's.
+fn labels_of_glb(bytes: &[u8], original: &ParsedMesh) -> Vec<i32> {
+    let n_json = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let root: serde_json::Value = serde_json::from_slice(&bytes[20..20 + n_json]).unwrap();
+    let found = parse(bytes, Format::Gltf).unwrap();
+    let place = |mesh: &ParsedMesh, t: [u32; 3]| t.map(|v| mesh.vertices[v as usize]);
+    let mut labels = vec![i32::MIN; original.n_polygons];
+    let mut triangles = found.triangles.iter();
+    for mesh in root["meshes"].as_array().unwrap() {
+        let extras = &mesh["primitives"][0]["extras"];
+        let label = extras["label"].as_i64().unwrap() as i32;
+        let runs: Vec<usize> = serde_json::from_value(extras["polygons"].clone()).unwrap();
+        for polygon in runs.chunks(2).flat_map(|run| run[0]..run[0] + run[1]) {
+            labels[polygon] = label;
+            let (one, other) = (*triangles.next().unwrap(), original.triangles[polygon]);
+            let pairs = place(&found, one).into_iter().zip(place(original, other));
+            for (a, b) in pairs.flat_map(|(a, b)| a.into_iter().zip(b)) {
+                assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{a} {b}");
+            }
+        }
+    }
+    assert_eq!(triangles.next(), None);
+    let nodes = root["nodes"].as_array().unwrap();
+    let with_meshes = nodes.iter().filter(|node| !node["mesh"].is_null());
+    let mut names: Vec<&str> = with_meshes.map(|n| n["name"].as_str().unwrap()).collect();
+    names.sort_unstable();
+    let mut expected = instances_of(original, &labels);
+    expected.sort_unstable();
+    assert_eq!(names, expected);
     labels
 }
 
@@ -281,14 +315,10 @@ fn a_made_shape_reads_the_same_in_every_format() {
     let labels: Vec<i32> = shape.labels.iter().map(|&l| l as i32).collect();
     let (vertices, faces) = (&shape.mesh.vertices, &shape.mesh.faces);
     let off = parse(write::off(&shape.mesh).as_bytes(), Format::Off).unwrap();
-    let text = write::obj(vertices, faces, &labels, |l| format!("label_{l}"), "m.mtl");
-    assert_eq!(parse(text.as_bytes(), Format::Obj).unwrap(), off);
-    assert_eq!(labels_of_obj(&text), labels);
-    let glb = write::glb("chair", vertices, faces, &labels, None, |l| {
-        (format!("label_{l}"), [0; 3])
-    });
-    let found = parse(&glb, Format::Gltf).unwrap();
-    assert_eq!(labels_of_glb(&glb, &found, &off), labels);
+    let text = write::obj(vertices, faces, &labelling(&labels), "m.mtl");
+    assert_eq!(labels_of_obj(text.as_bytes(), &off), labels);
+    let glb = write::glb("chair", vertices, faces, &labelling(&labels), None);
+    assert_eq!(labels_of_glb(&glb, &off), labels);
 }
 
 /// A prism over a C; the caps begin at a corner whose fan leaves them. By hand: 2 x 7 for the caps,

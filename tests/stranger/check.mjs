@@ -1,5 +1,5 @@
-// Each GLB named: a primitive and a material of its own colour for each label, all faces there, and, where
-// gltf-validator is installed beside this file, not one error.
+// Each GLB named: a node for each part and a material of its own colour for each label, all faces there, and,
+// where gltf-validator is installed beside this file, not one error.
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { basename } from "node:path";
@@ -11,17 +11,24 @@ for (const path of process.argv.slice(2)) {
   assert.equal(bytes.toString("latin1", 0, 4), "glTF", path);
   const gltf = JSON.parse(bytes.toString("utf8", 20, 20 + bytes.readUInt32LE(12)));
   const primitives = gltf.meshes.flatMap((mesh) => mesh.primitives);
-  assert.ok(primitives.length >= 2, `${path}: ${primitives.length} labels`);
-  const colours = new Set();
+  const parts = gltf.nodes.filter((node) => node.extras?.label !== undefined);
+  assert.equal(parts.length, primitives.length, path);
+  const [colours, here] = [new Set(), new Set()];
   let faces = 0;
+  for (const { name, extras, mesh } of parts) {
+    assert.match(name, new RegExp(`^label_${extras.label}\\.\\d{3}$`), path);
+    assert.equal(gltf.meshes[mesh].primitives[0].extras.label, extras.label, path);
+  }
   for (const { indices, material, extras } of primitives) {
     const { name, pbrMetallicRoughness } = gltf.materials[material];
     assert.equal(name, `label_${extras.label}`, path);
     colours.add(String(pbrMetallicRoughness.baseColorFactor));
     labels.add(extras.label);
+    here.add(extras.label);
     faces += gltf.accessors[indices].count / 3;
   }
-  assert.equal(colours.size, primitives.length, `${path}: two labels in one colour`);
+  assert.ok(here.size >= 2, `${path}: ${here.size} labels`);
+  assert.equal(colours.size, here.size, `${path}: two labels in one colour`);
   assert.ok(faces > 5000, `${path}: ${faces} faces`);
   let verdict = "";
   if (validator) {
@@ -29,7 +36,7 @@ for (const path of process.argv.slice(2)) {
     assert.equal(issues.numErrors, 0, JSON.stringify(issues.messages));
     verdict = ", valid";
   }
-  console.log(`${basename(path)}: ${faces} faces, ${primitives.length} labels${verdict}`);
+  console.log(`${basename(path)}: ${faces} faces, ${parts.length} parts, ${here.size} labels${verdict}`);
 }
 assert.ok(labels.size >= 3, `only ${labels.size} labels in all`);
 if (!validator) console.log("gltf-validator could not be had from npm: not validated");

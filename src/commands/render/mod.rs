@@ -4,8 +4,8 @@ mod canvas;
 pub(crate) mod pair;
 mod view;
 
-use super::export::original;
-use super::export_mesh::{colour, material};
+use super::export::Original;
+use super::export_mesh::{colour, styles};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::Render;
@@ -41,6 +41,7 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
     let mut sheet = Canvas::new(width, top + n_rows * (CELL + LINE + MARGIN) + MARGIN);
     draw_legend(&mut sheet, &legend);
     let progress = bar(shapes.len() as u64);
+    let styles = styles(&about.labels);
     for (i, shape) in shapes.iter().enumerate() {
         progress.set_message(shape.name.clone());
         let request = wire::GetLabelsRequest {
@@ -50,8 +51,9 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
             confidence: false,
         };
         let found = labels::receive(&mut session, request)?.labels;
-        let mesh = original(&mut session, &collection, &shape.name, found.len())?;
-        let colours: Vec<[u8; 3]> = found.iter().map(|&l| colour(l, &about.labels)).collect();
+        let original = Original::receive(&mut session, &collection, &shape.name)?;
+        let mesh = original.mesh(&shape.name, found.len())?;
+        let colours: Vec<[u8; 3]> = found.iter().map(|&l| colour(l, &styles)).collect();
         let x = MARGIN + i % n_columns * (CELL + MARGIN);
         let y = top + i / n_columns * (CELL + LINE + MARGIN);
         sheet.put(x, y, &picture(&mesh, &colours, up));
@@ -115,16 +117,15 @@ fn columns(n_shapes: usize) -> usize {
 
 /// Labels in use: text and colour of each.
 fn legend(labels: &[LabelInfo]) -> Vec<(String, [u8; 3])> {
+    let styles = styles(labels);
     let in_use = labels.iter().filter(|l| l.n_shapes > 0);
     in_use
-        .filter_map(|l| i32::try_from(l.id).ok())
-        .map(|id| {
-            let name = material(id, labels);
-            let name = name
-                .strip_prefix("label_")
-                .unwrap_or(&name)
-                .replace('_', " ");
-            (name, colour(id, labels))
+        .filter_map(|l| i32::try_from(l.id).ok().zip(Some(&l.name)))
+        .map(|(id, name)| {
+            (
+                format!("{id} {name}").trim_end().to_owned(),
+                colour(id, &styles),
+            )
         })
         .collect()
 }

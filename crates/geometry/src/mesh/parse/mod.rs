@@ -6,12 +6,12 @@
 
 mod content;
 mod encoding;
-mod gltf;
-mod obj;
+pub(super) mod gltf;
+pub(super) mod obj;
 mod off;
 mod ply;
 mod stl;
-mod text;
+pub(super) mod text;
 
 use super::{Format, ParsedMesh, Triangulator};
 pub use encoding::as_utf8;

@@ -68,6 +68,41 @@ const WITHOUT_SURFACE: [&[u8]; 37] = [
     b"matlib",
 ];
 
+/// Gives `each` the statements of a file: without comments, as they are, and the number of their
+/// first lines. Statements that go on in the next line are joined. Returns the number of comments
+/// that end in a backslash.
+pub(in crate::mesh) fn statements(
+    bytes: &[u8],
+    mut each: impl FnMut(&[u8], &[u8], usize) -> Result<(), ParseError>,
+) -> Result<usize, ParseError> {
+    let mut n_tolerated = 0;
+    let mut joined: Vec<u8> = Vec::new();
+    let mut first_line = 1;
+    for (number, whole) in Lines::new(bytes) {
+        let statement = before_comment(whole);
+        let line = whole.trim_ascii_end();
+        if joined.is_empty() {
+            first_line = number;
+        }
+        let continued = line.strip_suffix(b"\\");
+        let in_comment = statement.len() < line.len();
+        n_tolerated += usize::from(in_comment && continued.is_some());
+        let line = if in_comment { statement } else { line };
+        if let Some(head) = continued.filter(|_| !in_comment) {
+            joined.extend_from_slice(head);
+            joined.push(b' ');
+        } else if joined.is_empty() {
+            each(line, whole, number)?;
+        } else {
+            joined.extend_from_slice(line);
+            each(&joined, &joined, first_line)?;
+            joined.clear();
+        }
+    }
+    each(&joined, &joined, first_line)?;
+    Ok(n_tolerated)
+}
+
 /// The geometry of a file, as lines for `tobj`.
 #[derive(Default)]
 struct Geometry {
@@ -84,30 +119,8 @@ struct Geometry {
 impl Geometry {
     fn of(bytes: &[u8]) -> Result<Self, ParseError> {
         let mut geometry = Self::default();
-        let mut joined: Vec<u8> = Vec::new();
-        let mut first_line = 1;
-        for (number, line) in Lines::new(bytes) {
-            let statement = before_comment(line);
-            let line = line.trim_ascii_end();
-            if joined.is_empty() {
-                first_line = number;
-            }
-            let continued = line.strip_suffix(b"\\");
-            let in_comment = statement.len() < line.len();
-            geometry.n_tolerated += usize::from(in_comment && continued.is_some());
-            let line = if in_comment { statement } else { line };
-            if let Some(head) = continued.filter(|_| !in_comment) {
-                joined.extend_from_slice(head);
-                joined.push(b' ');
-            } else if joined.is_empty() {
-                geometry.push(line, number)?;
-            } else {
-                joined.extend_from_slice(line);
-                geometry.push(&joined, first_line)?;
-                joined.clear();
-            }
-        }
-        geometry.push(&joined, first_line)?;
+        let tolerated = statements(bytes, |statement, _, line| geometry.push(statement, line))?;
+        geometry.n_tolerated += tolerated;
         Ok(geometry)
     }
 

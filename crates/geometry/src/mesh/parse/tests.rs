@@ -374,15 +374,18 @@ fn concave_faces_have_the_area_they_have_in_every_format_and_in_exports() {
         assert_eq!(polygons[1].len(), 8);
         assert_eq!(polygons[1][0] as usize, 8 + start);
         let labels: Vec<i32> = (0..10).collect();
-        let named = |label: i32| (format!("label_{label}"), [0; 3]);
-        let glb = write::glb("c", &mesh.vertices, &polygons, &labels, None, named);
+        let labelling = write::Labelling {
+            labels: &labels,
+            confidence: None,
+            styles: &Default::default(),
+        };
+        let glb = write::glb("c", &mesh.vertices, &polygons, &labelling, None);
         let glb = parse(&glb, Format::Gltf).unwrap();
         assert!((area(&glb) - 30.0).abs() < 1e-6, "{start}");
         assert_eq!(glb.triangles.len(), mesh.triangles.len());
         let ply = write::ply(&mesh.vertices, &polygons, &[[0; 3]; 10], &labels);
         assert_eq!(parse(&ply, Format::Ply).unwrap(), mesh);
-        let name = |label: i32| format!("label_{label}");
-        let text = write::obj(&mesh.vertices, &polygons, &labels, name, "a.mtl");
+        let text = write::obj(&mesh.vertices, &polygons, &labelling, "a.mtl");
         assert_eq!(obj(&text).unwrap(), mesh);
         let lines: String = polygons
             .iter()

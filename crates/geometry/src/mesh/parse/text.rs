@@ -66,7 +66,7 @@ pub(super) fn before_comment(line: &[u8]) -> &[u8] {
 }
 
 /// Words separated by white space.
-pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
+pub(in crate::mesh) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     line.split(u8::is_ascii_whitespace)
         .filter(|word| !word.is_empty())
 }

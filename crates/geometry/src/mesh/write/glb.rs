@@ -1,28 +1,30 @@
-//! Writes labelled polygons as a binary glTF 2.0 file: a primitive and a named material for each
-//! label.
+//! Writes labelled polygons as a binary glTF 2.0 file: a node for each part instance, and a
+//! material for each label.
 //!
-//! All primitives share one list of positions. Triangles are grouped by label; each primitive lists
-//! its polygons of the input in its `extras`, as first and count of each run of consecutive ones.
-//! The triangles of a polygon are those of [`Triangulator`], on which its label was computed.
+//! Triangles are grouped by part instance; each primitive lists its polygons of the input in its
+//! `extras`, as first and count of each run of consecutive ones. The triangles of a polygon are
+//! those of [`Triangulator`], on which its label was computed.
 
-use super::{append, by_label, runs};
-use crate::mesh::Triangulator;
-use std::fmt::Write as _;
+use super::Labelling;
+use super::labelling::runs;
+use crate::mesh::{Triangulator, instances};
+use serde_json::{Value, json};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Sizes beyond which single precision would overflow or lose digits.
 const MIN_SIZE: f64 = 1e-30;
 const MAX_SIZE: f64 = 1e30;
 
 /// Positions in single precision, and their inverse transform: a translation and a factor.
-struct Placed {
-    positions: Vec<[f32; 3]>,
+pub(super) struct Placed {
+    pub(super) positions: Vec<[f32; 3]>,
     translation: [f64; 3],
     factor: f64,
 }
 
 /// Moves a mesh whose coordinates are not exact in single precision to the origin, where most
 /// digits survive. Positions that are not finite, which no polygon uses, become 0.
-fn place(vertices: &[[f64; 3]]) -> Placed {
+pub(super) fn place(vertices: &[[f64; 3]]) -> Placed {
     let finite = || vertices.iter().filter(|v| v.iter().all(|x| x.is_finite()));
     let exact = finite().flatten().all(|&x| f64::from(x as f32) == x);
     let (mut translation, mut factor) = ([0.0; 3], 1.0);
@@ -53,22 +55,8 @@ fn place(vertices: &[[f64; 3]]) -> Placed {
     }
 }
 
-/// Text as a JSON string.
-fn quoted(text: &str) -> String {
-    let mut out = String::from("\"");
-    for c in text.chars() {
-        match c {
-            '"' | '\\' => out.extend(['\\', c]),
-            c if c.is_control() => append(&mut out, format_args!("\\u{:04x}", c as u32)),
-            c => out.push(c),
-        }
-    }
-    out.push('"');
-    out
-}
-
-/// An sRGB component as linear light, which glTF requires.
-fn linear(c: u8) -> f64 {
+/// An sRGB component as linear light, which glTF and USD require.
+pub(super) fn linear(c: u8) -> f64 {
     let x = f64::from(c) / 255.0;
     if x <= 0.04045 {
         x / 12.92
@@ -78,7 +66,7 @@ fn linear(c: u8) -> f64 {
 }
 
 /// The rotation from a coordinate axis to +Y, which is up in glTF, as x, y, z, w.
-fn upright(up: [f64; 3]) -> [f64; 4] {
+fn rotation(up: [f64; 3]) -> [f64; 4] {
     use std::f64::consts::FRAC_1_SQRT_2 as H;
     match up.map(|x| x as i8) {
         [1, 0, 0] => [0.0, 0.0, H, H],
@@ -90,16 +78,160 @@ fn upright(up: [f64; 3]) -> [f64; 4] {
     }
 }
 
-/// A binary glTF file of one mesh, called `name`. `material` returns the name and sRGB colour of a
-/// label. If the coordinate axis `up` is not +Y, a node around the mesh turns it there.
+/// The JSON of a glTF file that entries are added to, and the bytes of one of its buffers.
+pub(super) struct Document {
+    pub(super) root: Value,
+    /// Bytes of the buffer that additions go to.
+    pub(super) binary: Vec<u8>,
+    /// Index of that buffer.
+    pub(super) buffer: usize,
+    materials: BTreeMap<i32, usize>,
+}
+
+impl Document {
+    pub(super) fn new(root: Value, buffer: usize, binary: Vec<u8>) -> Self {
+        let materials = BTreeMap::new();
+        Self {
+            root,
+            binary,
+            buffer,
+            materials,
+        }
+    }
+
+    /// A list of the root, created if it is missing.
+    pub(super) fn list(&mut self, name: &str) -> &mut Vec<Value> {
+        list(&mut self.root, name)
+    }
+
+    /// Adds an entry to a list of the root, and returns its index.
+    pub(super) fn push(&mut self, name: &str, entry: Value) -> usize {
+        let list = self.list(name);
+        list.push(entry);
+        list.len() - 1
+    }
+
+    /// Adds a view of bytes, and returns its index.
+    fn view(&mut self, bytes: impl IntoIterator<Item = u8>, target: u32) -> usize {
+        self.binary.resize(self.binary.len().next_multiple_of(4), 0);
+        let start = self.binary.len();
+        self.binary.extend(bytes);
+        let (buffer, length) = (self.buffer, self.binary.len() - start);
+        let view = json!({
+            "buffer": buffer, "byteOffset": start, "byteLength": length, "target": target,
+        });
+        self.push("bufferViews", view)
+    }
+
+    /// Adds an accessor of vertex indices, and returns its index.
+    pub(super) fn indices(&mut self, indices: &[u32]) -> usize {
+        const ELEMENT_ARRAY_BUFFER: u32 = 34963;
+        let bytes = indices.iter().flat_map(|v| v.to_le_bytes());
+        let view = self.view(bytes, ELEMENT_ARRAY_BUFFER);
+        let accessor = json!({
+            "bufferView": view, "componentType": 5125, "count": indices.len(), "type": "SCALAR",
+        });
+        self.push("accessors", accessor)
+    }
+
+    /// Adds an accessor of values at vertices, and returns its index.
+    pub(super) fn attribute<const N: usize>(&mut self, values: &[[f32; N]]) -> usize {
+        const ARRAY_BUFFER: u32 = 34962;
+        let (mut low, mut high) = ([f32::INFINITY; N], [f32::NEG_INFINITY; N]);
+        for p in values {
+            low = std::array::from_fn(|i| low[i].min(p[i]));
+            high = std::array::from_fn(|i| high[i].max(p[i]));
+        }
+        let bytes = values.iter().flatten().flat_map(|x| x.to_le_bytes());
+        let view = self.view(bytes, ARRAY_BUFFER);
+        let accessor = json!({
+            "bufferView": view, "componentType": 5126, "count": values.len(),
+            "type": format!("VEC{N}"), "min": low.as_slice(), "max": high.as_slice(),
+        });
+        self.push("accessors", accessor)
+    }
+
+    /// The index of the material of a label, which is added at its first use.
+    pub(super) fn material(&mut self, label: i32, labelling: &Labelling<'_>) -> usize {
+        if let Some(found) = self.materials.get(&label) {
+            return *found;
+        }
+        let style = labelling.style(label);
+        let [r, g, b] = style.colour.map(linear);
+        let material = json!({
+            "name": style.name,
+            "doubleSided": true,
+            "pbrMetallicRoughness":
+            {
+                "baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8,
+            },
+        });
+        let index = self.push("materials", material);
+        self.materials.insert(label, index);
+        index
+    }
+
+    /// Puts a node that turns `up` to +Y around nodes of a scene, unless it is that already.
+    pub(super) fn upright(
+        &mut self,
+        name: &str,
+        up: Option<[f64; 3]>,
+        nodes: Vec<Value>,
+    ) -> Vec<Value> {
+        let Some(up) = up.filter(|up| *up != [0.0, 1.0, 0.0]) else {
+            return nodes;
+        };
+        let name = format!("{name} upright");
+        let node = json!({ "name": name, "rotation": rotation(up), "children": nodes });
+        vec![self.push("nodes", node).into()]
+    }
+}
+
+/// A field of an object, null if it is missing. A value that is no object is replaced by one: files
+/// may hold any JSON where only some programs look.
+pub(super) fn field<'a>(object: &'a mut Value, name: &str) -> &'a mut Value {
+    if !object.is_object() {
+        *object = json!({});
+    }
+    &mut object[name]
+}
+
+/// A list in an object, created if it is missing.
+pub(super) fn list<'a>(object: &'a mut Value, name: &str) -> &'a mut Vec<Value> {
+    let list = field(object, name);
+    if !list.is_array() {
+        *list = json!([]);
+    }
+    match list {
+        Value::Array(list) => list,
+        _ => unreachable!("invariant: it was made an array"),
+    }
+}
+
+/// The `extras` of the node of a part instance.
+pub(super) fn part(name: &str, label: i32, number: u32) -> Value {
+    json!({ "label": label, "label_name": name, "instance": number })
+}
+
+/// The `extras` of a primitive: the label of its triangles, and their polygons of the input.
+pub(super) fn polygons(label: i32, members: &[u32]) -> Value {
+    let runs: Vec<usize> = runs(members)
+        .flat_map(|(first, count)| [first as usize, count])
+        .collect();
+    json!({ "label": label, "polygons": runs })
+}
+
+/// A binary glTF file of one mesh, called `name`, with a node for each part instance below its own.
+/// If the coordinate axis `up` is not +Y, a node around the mesh turns it there.
 ///
 /// ```
-/// use coseg_geometry::mesh::{Format, icosphere, parse, write};
+/// use coseg_geometry::mesh::write::{self, Labelling};
+/// use coseg_geometry::mesh::{Format, icosphere, parse};
 ///
 /// let sphere = icosphere(1);
-/// let labels = vec![0; sphere.faces.len()];
-/// let material = |label| (format!("part-{label}"), [200, 80, 40]);
-/// let file = write::glb("ball", &sphere.vertices, &sphere.faces, &labels, None, material);
+/// let (labels, styles) = (vec![0; sphere.faces.len()], Default::default());
+/// let labelling = Labelling { labels: &labels, confidence: None, styles: &styles };
+/// let file = write::glb("ball", &sphere.vertices, &sphere.faces, &labelling, None);
 /// assert_eq!(parse(&file, Format::Gltf)?.n_polygons, sphere.faces.len());
 /// # Ok::<_, coseg_geometry::mesh::ParseError>(())
 /// ```
@@ -110,115 +242,81 @@ pub fn glb<P: AsRef<[u32]>>(
     name: &str,
     vertices: &[[f64; 3]],
     polygons: &[P],
-    labels: &[i32],
+    labelling: &Labelling<'_>,
     up: Option<[f64; 3]>,
-    material: impl Fn(i32) -> (String, [u8; 3]),
 ) -> Vec<u8> {
-    assert_eq!(polygons.len(), labels.len(), "one label per polygon");
+    let found = instances(
+        vertices,
+        polygons,
+        labelling.labels,
+        &vec![0; polygons.len()],
+    );
+    let names = labelling.names(str::to_owned);
     let placed = place(vertices);
-    let mut binary: Vec<u8> = Vec::with_capacity(12 * (vertices.len() + 2 * polygons.len()));
-    let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
-    for p in &placed.positions {
-        low = std::array::from_fn(|i| low[i].min(p[i]));
-        high = std::array::from_fn(|i| high[i].max(p[i]));
-        binary.extend(p.iter().flat_map(|x| x.to_le_bytes()));
+    let mut document = new_document();
+    let mut members: Vec<Vec<u32>> = vec![Vec::new(); found.labels.len()];
+    for (polygon, &instance) in (0..).zip(&found.of_polygon) {
+        members[instance as usize].push(polygon);
     }
-    let triple = |t: [f64; 3]| format!("[{:?},{:?},{:?}]", t[0], t[1], t[2]);
-    let mut views = format!(
-        "{{\"buffer\":0,\"byteLength\":{},\"target\":34962}}",
-        binary.len()
-    );
-    let mut accessors = format!(
-        "{{\"bufferView\":0,\"componentType\":5126,\"count\":{},\"type\":\"VEC3\",\
-         \"min\":{},\"max\":{}}}",
-        vertices.len(),
-        triple(low.map(f64::from)),
-        triple(high.map(f64::from)),
-    );
-    let (mut primitives, mut materials) = (String::new(), String::new());
     let mut triangulator = Triangulator::default();
-    for (i, (label, members)) in by_label(labels).into_iter().enumerate() {
-        let start = binary.len();
-        for &polygon in &members {
+    let mut parts = Vec::new();
+    for ((&label, &number), members) in found.labels.iter().zip(&found.numbers).zip(&members) {
+        let mut triangles: Vec<u32> = Vec::new();
+        for &polygon in members {
             let corners = polygons[polygon as usize].as_ref();
-            triangulator.triangulate(vertices, corners, |triangle| {
-                binary.extend(triangle.iter().flat_map(|v| v.to_le_bytes()));
-            });
+            triangulator.triangulate(vertices, corners, |t| triangles.extend(t));
         }
-        let n_bytes = binary.len() - start;
-        append(
-            &mut views,
-            format_args!(
-                ",{{\"buffer\":0,\"byteOffset\":{start},\"byteLength\":{n_bytes},\"target\":34963}}"
-            ),
+        let used: BTreeSet<u32> = triangles.iter().copied().collect();
+        let local: BTreeMap<u32, u32> = used.iter().copied().zip(0..).collect();
+        let positions: Vec<[f32; 3]> = used.iter().map(|&v| placed.positions[v as usize]).collect();
+        let indices: Vec<u32> = triangles.iter().map(|v| local[v]).collect();
+        let positions = document.attribute(&positions);
+        let indices = document.indices(&indices);
+        let material = document.material(label, labelling);
+        let primitive = json!({
+            "attributes": { "POSITION": positions }, "indices": indices, "material": material,
+            "extras": self::polygons(label, members),
+        });
+        let called = format!("{}.{number:03}", names[&label]);
+        let mesh = document.push(
+            "meshes",
+            json!({ "name": called, "primitives": [primitive] }),
         );
-        append(
-            &mut accessors,
-            format_args!(
-                ",{{\"bufferView\":{},\"componentType\":5125,\"count\":{},\"type\":\"SCALAR\"}}",
-                i + 1,
-                n_bytes / 4
-            ),
-        );
-        let comma = if i > 0 { "," } else { "" };
-        let mut runs_text = String::new();
-        for (first, count) in runs(&members) {
-            let comma = if runs_text.is_empty() { "" } else { "," };
-            append(&mut runs_text, format_args!("{comma}{first},{count}"));
-        }
-        append(
-            &mut primitives,
-            format_args!(
-                "{comma}{{\"attributes\":{{\"POSITION\":0}},\"indices\":{},\"material\":{i},\
-                 \"extras\":{{\"label\":{label},\"polygons\":[{runs_text}]}}}}",
-                i + 1
-            ),
-        );
-        let (name, colour) = material(label);
-        let [r, g, b] = colour.map(linear);
-        append(
-            &mut materials,
-            format_args!(
-                "{comma}{{\"name\":{},\"doubleSided\":true,\
-                 \"pbrMetallicRoughness\":{{\"baseColorFactor\":\
-                 [{r:.6},{g:.6},{b:.6},1.0],\"metallicFactor\":0.0,\"roughnessFactor\":0.8}}}}",
-                quoted(&name)
-            ),
-        );
+        let extras = part(&names[&label], label, number);
+        let node = json!({ "name": called, "mesh": mesh, "extras": extras });
+        parts.push(Value::from(document.push("nodes", node)));
     }
-    let mut node = format!("{{\"name\":{},\"mesh\":0", quoted(name));
+    finish(document, name, &placed, up, parts)
+}
+
+/// The document of a file with nothing in it.
+pub(super) fn new_document() -> Document {
+    let root =
+        json!({ "asset": { "version": "2.0", "generator": "coseg" }, "buffers": [{}], "scene": 0 });
+    Document::new(root, 0, Vec::new())
+}
+
+/// The file of a document with a scene of one node, called `name`, which takes its children to
+/// their place.
+pub(super) fn finish(
+    mut document: Document,
+    name: &str,
+    placed: &Placed,
+    up: Option<[f64; 3]>,
+    children: Vec<Value>,
+) -> Vec<u8> {
+    let mut node = json!({ "name": name, "children": children });
     if placed.translation != [0.0; 3] {
-        append(
-            &mut node,
-            format_args!(",\"translation\":{}", triple(placed.translation)),
-        );
+        node["translation"] = json!(placed.translation);
     }
     if placed.factor != 1.0 {
-        append(
-            &mut node,
-            format_args!(",\"scale\":{}", triple([placed.factor; 3])),
-        );
+        node["scale"] = vec![placed.factor; 3].into();
     }
-    node.push('}');
-    if let Some(up) = up.filter(|up| *up != [0.0, 1.0, 0.0]) {
-        let [x, y, z, w] = upright(up);
-        let name = quoted(&format!("{name} upright"));
-        node = format!(
-            "{{\"name\":{name},\"rotation\":[{x:?},{y:?},{z:?},{w:?}],\"children\":[1]}},{node}"
-        );
-    }
-    let mut json = String::new();
-    let _ = write!(
-        json,
-        "{{\"asset\":{{\"version\":\"2.0\",\"generator\":\"coseg\"}},\
-         \"scene\":0,\"scenes\":[{{\"nodes\":[0]}}],\
-         \"nodes\":[{node}],\"meshes\":[{{\"name\":{},\"primitives\":[{primitives}]}}],\
-         \"materials\":[{materials}],\"accessors\":[{accessors}],\"bufferViews\":[{views}],\
-         \"buffers\":[{{\"byteLength\":{}}}]}}",
-        quoted(name),
-        binary.len(),
-    );
-    glb_of(json, binary)
+    let node = document.push("nodes", node);
+    let nodes = document.upright(name, up, vec![node.into()]);
+    document.push("scenes", json!({ "nodes": nodes }));
+    document.root["buffers"][0]["byteLength"] = document.binary.len().into();
+    glb_of(document.root.to_string(), document.binary)
 }
 
 /// A file of a JSON and a binary chunk, each padded to four bytes.
@@ -235,7 +333,13 @@ pub fn glb_of(mut json: String, mut binary: Vec<u8>) -> Vec<u8> {
     while !json.len().is_multiple_of(4) {
         json.push(' ');
     }
-    let length = 12 + 8 + json.len() + 8 + binary.len();
+    // A chunk of data without any would be an error.
+    let data = if binary.is_empty() {
+        0
+    } else {
+        8 + binary.len()
+    };
+    let length = 12 + 8 + json.len() + data;
     let mut out = Vec::with_capacity(length);
     out.extend_from_slice(b"glTF");
     for word in [2, length, json.len()] {
@@ -243,43 +347,91 @@ pub fn glb_of(mut json: String, mut binary: Vec<u8>) -> Vec<u8> {
     }
     out.extend_from_slice(b"JSON");
     out.extend_from_slice(json.as_bytes());
-    out.extend_from_slice(&(binary.len() as u32).to_le_bytes());
-    out.extend_from_slice(b"BIN\0");
-    out.extend_from_slice(&binary);
+    if data > 0 {
+        out.extend_from_slice(&(binary.len() as u32).to_le_bytes());
+        out.extend_from_slice(b"BIN\0");
+        out.extend_from_slice(&binary);
+    }
     out
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::{LabelStyle, Labelling};
     use super::glb;
+    use crate::mesh::parse::gltf::container;
     use crate::mesh::{Format, cross, dot, parse};
+    use std::collections::BTreeMap;
 
-    fn material(label: i32) -> (String, [u8; 3]) {
-        (format!("label \"{label}\""), [255, 128, 0])
+    fn labelling<'a>(labels: &'a [i32], styles: &'a BTreeMap<i32, LabelStyle>) -> Labelling<'a> {
+        Labelling {
+            labels,
+            confidence: None,
+            styles,
+        }
     }
 
     #[test]
-    fn our_own_reader_finds_the_triangles_by_label_and_the_runs_say_which_they_are() {
-        let vertices = [[0.0; 3], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.5]];
+    fn there_is_a_node_for_each_part_instance_and_the_runs_say_which_polygons_it_has() {
+        let vertices = [
+            [0.0; 3],
+            [1.0, 0.0, 0.0],
+            [1.0, 1.0, 0.0],
+            [0.0, 1.0, 0.5],
+            [5.0, 0.0, 0.0],
+        ];
         let polygons = [
             vec![0, 1, 2, 3],
             vec![0, 1, 2],
             vec![1, 2, 3],
             vec![3, 2, 1],
+            vec![4, 4, 4],
         ];
-        let bytes = glb("a", &vertices, &polygons, &[7, -1, 7, 7], None, material);
+        let seat = LabelStyle {
+            name: "seat \"7\"".to_owned(),
+            colour: [255, 128, 0],
+        };
+        let styles = [(7, seat)].into();
+        let labels = [7, -1, 7, 7, 9];
+        let bytes = glb(
+            "a",
+            &vertices,
+            &polygons,
+            &labelling(&labels, &styles),
+            None,
+        );
         assert_eq!(bytes.len() % 4, 0);
         let mesh = parse(&bytes, Format::Gltf).unwrap();
-        assert_eq!(mesh.vertices, vertices);
-        let expected = [[0, 1, 2], [0, 1, 2], [0, 2, 3], [1, 2, 3], [3, 2, 1]];
-        assert_eq!(mesh.triangles, expected);
-        let text = String::from_utf8_lossy(&bytes).into_owned();
-        assert!(text.contains("{\"label\":-1,\"polygons\":[1,1]}"), "{text}");
-        assert!(
-            text.contains("{\"label\":7,\"polygons\":[0,1,2,2]}"),
-            "{text}"
+        let at = |t: &[u32; 3]| t.map(|v| mesh.vertices[v as usize]);
+        let expected = [
+            [0, 1, 2],
+            [0, 1, 2],
+            [0, 2, 3],
+            [1, 2, 3],
+            [3, 2, 1],
+            [4; 3],
+        ];
+        let expected = expected.map(|t| t.map(|v| vertices[v]));
+        assert!(mesh.triangles.iter().map(at).eq(expected));
+        let (json, _) = container(&bytes).unwrap();
+        let root: serde_json::Value = serde_json::from_slice(json).unwrap();
+        let nodes = root["nodes"].as_array().unwrap();
+        let names: Vec<&str> = nodes.iter().map(|n| n["name"].as_str().unwrap()).collect();
+        assert_eq!(
+            names,
+            ["unlabelled.001", "seat \"7\".001", "label_9.001", "a"]
         );
-        assert!(text.contains("\"name\":\"label \\\"7\\\"\""), "{text}");
+        let extras = &nodes[1]["extras"];
+        assert_eq!(
+            (&extras["label"], &extras["instance"]),
+            (&7.into(), &1.into())
+        );
+        let primitive = &root["meshes"][1]["primitives"][0];
+        assert_eq!(
+            primitive["extras"]["polygons"],
+            serde_json::json!([0, 1, 2, 2])
+        );
+        assert_eq!(root["materials"][1]["name"], "seat \"7\"");
     }
 
     #[test]
@@ -290,11 +442,19 @@ mod tests {
                 up[k] = sign;
                 // The axis itself, and a triangle that distinguishes turning from mirroring.
                 let vertices = [up, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-                let bytes = glb("a", &vertices, &[[1, 2, 3]], &[0], Some(up), material);
+                let styles = BTreeMap::new();
+                let polygons = [vec![1, 2, 3], vec![0]];
+                let bytes = glb(
+                    "a",
+                    &vertices,
+                    &polygons,
+                    &labelling(&[0, 1], &styles),
+                    Some(up),
+                );
                 let found = parse(&bytes, Format::Gltf).unwrap().vertices;
                 let close = |a: f64, b: f64| (a - b).abs() < 1e-12;
-                assert!(close(found[0][1], 1.0), "{up:?}: {:?}", found[0]);
-                let [a, b, c] = [1, 2, 3].map(|v| found[v]);
+                assert!(close(found[3][1], 1.0), "{up:?}: {:?}", found[3]);
+                let [a, b, c] = [0, 1, 2].map(|v| found[v]);
                 assert!(close(dot(a, cross(b, c)), 1.0), "{up:?} is mirrored");
                 let has_node = String::from_utf8_lossy(&bytes).contains("\"rotation\"");
                 assert_eq!(has_node, up != [0.0, 1.0, 0.0]);
@@ -307,7 +467,14 @@ mod tests {
         for (offset, size) in [(500_000.125, 0.001), (0.0, 1e100), (1e-90, 1e-100)] {
             let at = |x: f64, y: f64| [offset + x * size, offset + y * size, offset];
             let vertices = [at(0.1, 0.2), at(1.3, 0.0), at(0.7, 1.1), [f64::NAN; 3]];
-            let bytes = glb("a", &vertices, &[[0, 1, 2]], &[0], None, material);
+            let styles = BTreeMap::new();
+            let bytes = glb(
+                "a",
+                &vertices,
+                &[[0, 1, 2]],
+                &labelling(&[0], &styles),
+                None,
+            );
             let mesh = parse(&bytes, Format::Gltf).unwrap();
             for (found, wanted) in mesh.vertices.iter().zip(&vertices).take(3) {
                 for i in 0..3 {

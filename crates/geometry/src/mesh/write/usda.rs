@@ -1,7 +1,14 @@
 //! Writes labelled polygons as a text file of Universal Scene Description: a mesh with a
 //! `GeomSubset` and a material for each label.
 
-use super::{append, by_label};
+use super::glb::linear;
+use super::labelling::by_label;
+use super::{LabelStyle, Labelling, append};
+use crate::mesh::{Instances, instances};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// The family of subsets that hold labels.
+const PARTS: &str = "coseg:parts";
 
 /// A name in the syntax of USD: letters, digits and underscores, no digit first.
 fn identifier(name: &str) -> String {
@@ -42,18 +49,22 @@ fn upright(up: Option<[f64; 3]>) -> (&'static str, &'static str) {
     }
 }
 
-/// Writes a `.usda` file of one mesh, called `name` as far as USD allows. `material` returns the
-/// name and sRGB colour of a label. Faces keep their order; `primvars:label` has the label of each.
-/// The stage has the coordinate axis `up`, if it is known, and interprets a unit as a metre, like
-/// glTF.
+/// Writes a `.usda` file of one mesh, called `name` as far as USD allows. Faces keep their order.
+/// As primvars of faces it has `coseg:label`, `coseg:instance` (the number of the part among those
+/// of its label, from 1) and, where it is known, `coseg:confidence`. Its subsets are those of a
+/// family `coseg:parts`, one for each label with `coseg:label` and `coseg:name` (with
+/// `each_instance` one for each part instance, with `coseg:instance`), and of a family
+/// `materialBind`, one for each label's material. The stage has the coordinate axis `up`, if it is
+/// known, and interprets a unit as a metre, like glTF.
 ///
 /// ```
-/// use coseg_geometry::mesh::{icosphere, write};
+/// use coseg_geometry::mesh::icosphere;
+/// use coseg_geometry::mesh::write::{self, Labelling};
 ///
 /// let sphere = icosphere(0);
-/// let labels = vec![3; sphere.faces.len()];
-/// let material = |label| (format!("part-{label}"), [200, 80, 40]);
-/// let text = write::usda("ball", &sphere.vertices, &sphere.faces, &labels, None, material);
+/// let (labels, styles) = (vec![3; sphere.faces.len()], Default::default());
+/// let labelling = Labelling { labels: &labels, confidence: None, styles: &styles };
+/// let text = write::usda("ball", &sphere.vertices, &sphere.faces, &labelling, None, false);
 /// assert!(text.starts_with("#usda 1.0"));
 /// assert!(text.contains("def Xform \"ball\""));
 /// ```
@@ -64,12 +75,120 @@ pub fn usda<P: AsRef<[u32]>>(
     name: &str,
     vertices: &[[f64; 3]],
     polygons: &[P],
-    labels: &[i32],
+    labelling: &Labelling<'_>,
     up: Option<[f64; 3]>,
-    material: impl Fn(i32) -> (String, [u8; 3]),
+    each_instance: bool,
 ) -> String {
-    assert_eq!(polygons.len(), labels.len(), "one label per polygon");
     let root = identifier(name);
+    let (up_axis, turn) = upright(up);
+    let mut out = format!(
+        "#usda 1.0\n(\n    defaultPrim = \"{root}\"\n    metersPerUnit = 1\n{up_axis})\n\n\
+         def Xform \"{root}\"\n{{\n"
+    );
+    if let Some((operation, _)) = turn.split_once(' ') {
+        append(
+            &mut out,
+            format_args!(
+                "    double xformOp:{turn}\n    \
+                 uniform token[] xformOpOrder = [\"xformOp:{operation}\"]\n\n"
+            ),
+        );
+    }
+    out.push_str("    def Mesh \"mesh\"\n    {\n");
+    surface(&mut out, vertices, polygons);
+    let objects = vec![0; polygons.len()];
+    let found = instances(vertices, polygons, labelling.labels, &objects);
+    let instance = found.of_polygon.iter().map(|&i| found.numbers[i as usize]);
+    primvar(&mut out, "int[]", "label", labelling.labels);
+    primvar(&mut out, "int[]", "instance", instance);
+    if let Some(confidence) = labelling.confidence {
+        primvar(&mut out, "float[]", "confidence", confidence);
+    }
+    out.push_str(
+        "        uniform token subdivisionScheme = \"none\"\n        \
+         uniform token subsetFamily:coseg:parts:familyType = \"partition\"\n        \
+         uniform token subsetFamily:materialBind:familyType = \"partition\"\n",
+    );
+    let materials = subsets(&mut out, &root, labelling, &found, each_instance);
+    append(
+        &mut out,
+        format_args!("    }}\n\n    def Scope \"Materials\"\n    {{{materials}    }}\n}}\n"),
+    );
+    out
+}
+
+/// Writes the subsets of both families, and returns the materials that one of them binds.
+fn subsets(
+    out: &mut String,
+    root: &str,
+    labelling: &Labelling<'_>,
+    found: &Instances,
+    each_instance: bool,
+) -> String {
+    let mut materials = String::new();
+    let names = labelling.names(identifier);
+    let mut taken: BTreeSet<String> = names.values().cloned().collect();
+    let mut free = |mut name: String| {
+        while !taken.insert(name.clone()) {
+            name.push('_');
+        }
+        name
+    };
+    let members = by_label(labelling.labels);
+    for (label, members) in &members {
+        let LabelStyle {
+            name: shown,
+            colour,
+        } = labelling.style(*label);
+        let name = &names[label];
+        let about = format!(
+            "            custom int coseg:label = {label}\n            \
+             custom string coseg:name = {}\n",
+            quoted(&shown)
+        );
+        materials.push_str(&material(root, name, colour));
+        if !each_instance {
+            subset(out, name, PARTS, members, ("", &about));
+            continue;
+        }
+        let mut pieces: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
+        for &face in members {
+            let number = found.numbers[found.of_polygon[face as usize] as usize];
+            pieces.entry(number).or_default().push(face);
+        }
+        for (number, faces) in pieces {
+            let name = free(format!("{name}_{number:03}"));
+            let about = format!("{about}            custom int coseg:instance = {number}\n");
+            subset(out, &name, PARTS, &faces, ("", &about));
+        }
+    }
+    // A subset is of one family, so each label has a second one to bind its material.
+    for (label, members) in &members {
+        let name = &names[label];
+        let binding = format!("            rel material:binding = </{root}/Materials/{name}>\n");
+        let api = " (\n            prepend apiSchemas = [\"MaterialBindingAPI\"]\n        )";
+        let bound = free(format!("{name}_material"));
+        subset(out, &bound, "materialBind", members, (api, &binding));
+    }
+    materials
+}
+
+/// The material of a label; colours of materials are linear.
+fn material(root: &str, name: &str, colour: [u8; 3]) -> String {
+    let [r, g, b] = colour.map(linear);
+    format!(
+        "\n        def Material \"{name}\"\n        {{\n            \
+         token outputs:surface.connect = \
+         </{root}/Materials/{name}/Surface.outputs:surface>\n\n            \
+         def Shader \"Surface\"\n            {{\n                \
+         uniform token info:id = \"UsdPreviewSurface\"\n                \
+         color3f inputs:diffuseColor = ({r:.4}, {g:.4}, {b:.4})\n                \
+         token outputs:surface\n            }}\n        }}\n"
+    )
+}
+
+/// Points, faces and extent of a mesh.
+fn surface<P: AsRef<[u32]>>(out: &mut String, vertices: &[[f64; 3]], polygons: &[P]) {
     let number = |x: f64| if x.is_finite() { x } else { 0.0 };
     let point = |v: &[f64; 3]| {
         let [x, y, z] = v.map(number);
@@ -80,100 +199,127 @@ pub fn usda<P: AsRef<[u32]>>(
         low = std::array::from_fn(|i| low[i].min(number(v[i])));
         high = std::array::from_fn(|i| high[i].max(number(v[i])));
     }
-    let (up_axis, turn) = upright(up);
-    let mut out = format!(
-        "#usda 1.0\n(\n    defaultPrim = \"{root}\"\n    metersPerUnit = 1\n{up_axis})\n\n\
-         def Xform \"{root}\"\n{{\n"
-    );
-    if let Some((operation, _)) = turn.split_once(' ') {
-        append(
-            &mut out,
-            format_args!(
-                "    double xformOp:{turn}\n    uniform token[] xformOpOrder = \
-                 [\"xformOp:{operation}\"]\n\n"
-            ),
-        );
-    }
-    out.push_str("    def Mesh \"mesh\"\n    {\n");
     let counts = polygons.iter().map(|p| p.as_ref().len());
     let corners = polygons.iter().flat_map(|p| p.as_ref());
     out.push_str("        float3[] extent = ");
-    list(&mut out, [point(&low), point(&high)]);
+    list(out, [point(&low), point(&high)]);
     out.push_str("\n        int[] faceVertexCounts = ");
-    list(&mut out, counts);
+    list(out, counts);
     out.push_str("\n        int[] faceVertexIndices = ");
-    list(&mut out, corners);
+    list(out, corners);
     out.push_str("\n        point3f[] points = ");
-    list(&mut out, vertices.iter().map(point));
-    out.push_str("\n        int[] primvars:label = ");
-    list(&mut out, labels);
-    out.push_str(
-        " (\n            interpolation = \"uniform\"\n        )\n        uniform token \
-         subdivisionScheme = \"none\"\n        uniform token subsetFamily:materialBind:familyType \
-         = \"partition\"\n",
-    );
-    let mut materials = String::new();
-    for (label, members) in by_label(labels) {
-        let (name, colour) = material(label);
-        let name = identifier(&name);
-        append(
-            &mut out,
-            format_args!(
-                "\n        def GeomSubset \"{name}\" (\n            prepend apiSchemas = \
-                 [\"MaterialBindingAPI\"]\n        )\n        {{\n            uniform token \
-                 elementType = \"face\"\n            \
-                 uniform token familyName = \"materialBind\"\n            int[] indices = "
-            ),
-        );
-        list(&mut out, members);
-        append(
-            &mut out,
-            format_args!(
-                "\n            rel material:binding = </{root}/Materials/{name}>\n            \
-                 custom int label = {label}\n        }}\n"
-            ),
-        );
-        let [r, g, b] = colour.map(|c| f64::from(c) / 255.0);
-        append(
-            &mut materials,
-            format_args!(
-                "\n        def Material \"{name}\"\n        {{\n            \
-                 token outputs:surface.connect = \
-                 </{root}/Materials/{name}/Surface.outputs:surface>\n\n            \
-                 def Shader \"Surface\"\n            {{\n                uniform token info:id \
-                 = \"UsdPreviewSurface\"\n                \
-                 color3f inputs:diffuseColor = ({r:.4}, {g:.4}, {b:.4})\n                \
-                 token outputs:surface\n            }}\n        }}\n"
-            ),
-        );
-    }
+    list(out, vertices.iter().map(point));
+    out.push('\n');
+}
+
+/// A value for each face.
+fn primvar<T: std::fmt::Display>(
+    out: &mut String,
+    kind: &str,
+    name: &str,
+    values: impl IntoIterator<Item = T>,
+) {
+    append(out, format_args!("        {kind} primvars:coseg:{name} = "));
+    list(out, values);
+    out.push_str(" (\n            interpolation = \"uniform\"\n        )\n");
+}
+
+/// A subset of faces, with its API schemas `api` and its further properties `more`.
+fn subset(out: &mut String, name: &str, family: &str, faces: &[u32], (api, more): (&str, &str)) {
     append(
-        &mut out,
-        format_args!("    }}\n\n    def Scope \"Materials\"\n    {{{materials}    }}\n}}\n"),
+        out,
+        format_args!(
+            "\n        def GeomSubset \"{name}\"{api}\n        {{\n            \
+             uniform token elementType = \"face\"\n            \
+             uniform token familyName = \"{family}\"\n            int[] indices = "
+        ),
     );
+    list(out, faces);
+    append(out, format_args!("\n{more}        }}\n"));
+}
+
+/// Text as a string of USD.
+fn quoted(text: &str) -> String {
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            '\n' => out.push_str("\\n"),
+            c if c.is_control() => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out.push('"');
     out
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::{LabelStyle, Labelling};
     use super::usda;
+
+    #[test]
+    fn each_part_instance_has_a_subset_on_request() {
+        let vertices: Vec<[f64; 3]> = (0..10)
+            .map(|i| [f64::from(i % 3), f64::from(i * i), 0.0])
+            .collect();
+        let polygons = [[0, 1, 2], [3, 4, 5], [1, 2, 6], [7, 8, 9]];
+        let named = |name: &str| LabelStyle {
+            name: name.to_owned(),
+            colour: [0; 3],
+        };
+        let styles = [(2, named("leg")), (3, named("leg_001"))].into();
+        let labelling = Labelling {
+            labels: &[2, 2, 2, 3],
+            confidence: None,
+            styles: &styles,
+        };
+        let text = usda("a", &vertices, &polygons, &labelling, None, true);
+        for part in [
+            "def GeomSubset \"leg_001_\"",
+            "def GeomSubset \"leg_002\"",
+            "def GeomSubset \"leg_001_001\"",
+            "def GeomSubset \"leg_material\" (",
+            "            int[] indices = [0, 2]\n            \
+             custom int coseg:label = 2\n            \
+             custom string coseg:name = \"leg\"\n            custom int coseg:instance = 1\n",
+            "            int[] indices = [0, 1, 2]\n            rel material:binding",
+        ] {
+            assert!(text.contains(part), "{part:?} in\n{text}");
+        }
+        let family = "familyName = \"coseg:parts\"";
+        assert_eq!(text.matches(family).count(), 3);
+    }
 
     #[test]
     fn faces_keep_their_order_and_each_label_has_a_subset() {
         let vertices = [[0.0; 3], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 1e-7]];
         let polygons = [vec![0, 1, 2, 3], vec![0, 1, 2], vec![1, 2, 3]];
-        let material = |label: i32| (format!("label {label}"), [255, 0, 51]);
-        let text = usda("7 chair", &vertices, &polygons, &[2, -1, 2], None, material);
+        let part = LabelStyle {
+            name: "big \"part\"".to_owned(),
+            colour: [255, 0, 51],
+        };
+        let styles = [(2, part)].into();
+        let labelling = Labelling {
+            labels: &[2, -1, 2],
+            confidence: Some(&[0.5, 1.0, 0.25]),
+            styles: &styles,
+        };
+        let text = usda("7 chair", &vertices, &polygons, &labelling, None, false);
         for line in [
             "    defaultPrim = \"_7_chair\"",
             "        int[] faceVertexCounts = [4, 3, 3]",
             "        int[] faceVertexIndices = [0, 1, 2, 3, 0, 1, 2, 1, 2, 3]",
-            "        int[] primvars:label = [2, -1, 2] (",
-            "        def GeomSubset \"label_2\" (",
-            "        def GeomSubset \"label__1\" (",
+            "        int[] primvars:coseg:label = [2, -1, 2] (",
+            "        int[] primvars:coseg:instance = [1, 1, 1] (",
+            "        float[] primvars:coseg:confidence = [0.5, 1, 0.25] (",
+            "        def GeomSubset \"big__part_\"",
+            "            custom string coseg:name = \"big \\\"part\\\"\"",
+            "        def GeomSubset \"unlabelled\"",
             "            int[] indices = [0, 2]",
-            "            rel material:binding = </_7_chair/Materials/label_2>",
-            "                color3f inputs:diffuseColor = (1.0000, 0.0000, 0.2000)",
+            "        def GeomSubset \"big__part__material\" (",
+            "            rel material:binding = </_7_chair/Materials/big__part_>",
+            "                color3f inputs:diffuseColor = (1.0000, 0.0000, 0.0331)",
         ] {
             assert!(text.lines().any(|l| l == line), "{line:?} in\n{text}");
         }
@@ -196,7 +342,7 @@ mod tests {
                 ["    upAxis = \"Y\"", "    double xformOp:rotateZ = -90"],
             ),
         ] {
-            let text = usda("a", &vertices, &polygons, &[2, -1, 2], Some(up), material);
+            let text = usda("a", &vertices, &polygons, &labelling, Some(up), false);
             for line in lines {
                 assert!(text.lines().any(|l| l == line), "{line:?} in\n{text}");
             }

@@ -12,7 +12,7 @@ use std::borrow::Cow;
 use std::cell::{Cell, OnceCell};
 
 /// Standard base64, with or without padding.
-const BASE64: GeneralPurpose = GeneralPurpose::new(
+pub(in crate::mesh) const BASE64: GeneralPurpose = GeneralPurpose::new(
     &base64::alphabet::STANDARD,
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
 );
@@ -342,7 +342,7 @@ fn part(bytes: &[u8], offset: usize, length: usize) -> Option<&[u8]> {
 }
 
 /// The bytes of a `data:` URI; other URIs are not followed.
-fn data_uri(uri: &str, location: &str) -> Result<Vec<u8>, ParseError> {
+pub(in crate::mesh) fn data_uri(uri: &str, location: &str) -> Result<Vec<u8>, ParseError> {
     let is_data = uri
         .get(..5)
         .is_some_and(|start| start.eq_ignore_ascii_case("data:"));

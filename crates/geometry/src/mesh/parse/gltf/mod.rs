@@ -9,7 +9,7 @@
 //! mesh is read once. Points and lines are ignored; skins and morph targets are not applied. No
 //! other file is read.
 
-mod buffers;
+pub(in crate::mesh) mod buffers;
 mod compressed;
 mod document;
 
@@ -21,6 +21,7 @@ use nalgebra::{Matrix4, Point3};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Range;
 
 /// Vertices and corners that a scene may place beyond one for each two bytes of its file. Without a
 /// limit, nodes that place one mesh repeatedly could make a small file as large as they like.
@@ -37,7 +38,7 @@ fn fault(location: impl ToString, why: impl ToString) -> ParseError {
 }
 
 /// The JSON and the binary chunk of a file of either kind.
-fn container(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
+pub(in crate::mesh) fn container(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
     if bytes.starts_with(b"glTF") {
         return binary(bytes);
     }
@@ -101,11 +102,25 @@ fn binary(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), ParseError> {
     }
 }
 
+/// Consecutive polygons that one primitive became where a node places it.
+pub(in crate::mesh) struct Span {
+    /// The node; in a file without nodes each mesh is placed by none.
+    pub(in crate::mesh) node: Option<usize>,
+    pub(in crate::mesh) mesh: usize,
+    pub(in crate::mesh) primitive: usize,
+    pub(in crate::mesh) polygons: Range<usize>,
+    /// The vertex of the whole that the primitive's first one became.
+    pub(in crate::mesh) first_vertex: u32,
+    /// Whether the second and third corner of each triangle have changed places.
+    pub(in crate::mesh) mirrored: bool,
+}
+
 /// The scene during its assembly.
 struct Scene<'a> {
     document: &'a Document,
     buffers: Buffers<'a>,
     polygons: Polygons,
+    spans: Vec<Span>,
     /// Vertices and corners placed so far, and bytes of the file.
     n_placed: u64,
     n_bytes: u64,
@@ -133,12 +148,33 @@ impl Scene<'_> {
         Ok(())
     }
 
-    fn mesh(&mut self, index: Whole, mesh: &Mesh, to: &Matrix4<f64>) -> Result<(), ParseError> {
+    fn mesh(
+        &mut self,
+        node: Option<usize>,
+        index: Whole,
+        mesh: &Mesh,
+        to: &Matrix4<f64>,
+    ) -> Result<(), ParseError> {
         // The first vertex of each accessor's positions, once placed.
         let mut bases = BTreeMap::new();
+        // Where left and right are exchanged, faces turn inside out.
+        let mirrored = to.fixed_view::<3, 3>(0, 0).determinant() < 0.0;
         for (i, primitive) in mesh.primitives.iter().enumerate() {
             let location = format!("meshes[{}].primitives[{i}]", index.0);
-            self.primitive(primitive, &location, to, &mut bases)?;
+            let first = self.polygons.mesh.n_polygons;
+            self.primitive(primitive, &location, (to, mirrored), &mut bases)?;
+            let polygons = first..self.polygons.mesh.n_polygons;
+            let positions = primitive.positions().and_then(|p| bases.get(&p.0));
+            if let Some(&first_vertex) = positions.filter(|_| !polygons.is_empty()) {
+                self.spans.push(Span {
+                    node,
+                    mesh: index.0,
+                    primitive: i,
+                    polygons,
+                    first_vertex,
+                    mirrored,
+                });
+            }
         }
         Ok(())
     }
@@ -147,7 +183,7 @@ impl Scene<'_> {
         &mut self,
         primitive: &Primitive,
         location: &str,
-        transform: &Matrix4<f64>,
+        (transform, mirrored): (&Matrix4<f64>, bool),
         bases: &mut BTreeMap<usize, u32>,
     ) -> Result<(), ParseError> {
         let mode = match primitive.mode() {
@@ -217,15 +253,13 @@ impl Scene<'_> {
             Mode::Triangles => n_corners / 3,
             _ => n_corners.saturating_sub(2),
         };
-        // A transform that exchanges left and right turns faces inside out.
-        let mirrors = transform.fixed_view::<3, 3>(0, 0).determinant() < 0.0;
         for i in 0..n_triangles {
             let [a, mut b, mut c] = match mode {
                 Mode::Triangles => [corners[3 * i], corners[3 * i + 1], corners[3 * i + 2]],
                 Mode::Strip => [corners[i], corners[i + 1 + i % 2], corners[i + 2 - i % 2]],
                 Mode::Fan => [corners[i + 1], corners[i + 2], corners[0]],
             };
-            if mirrors {
+            if mirrored {
                 std::mem::swap(&mut b, &mut c);
             }
             if let Some(beyond) = [a, b, c].into_iter().find(|&v| v as usize >= n_vertices) {
@@ -293,12 +327,18 @@ fn roots(document: &Document) -> Result<(List, Cow<'_, [Whole]>), ParseError> {
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
+    spans(bytes).map(|(mesh, _)| mesh)
+}
+
+/// The mesh of a file, and what its polygons come from, in their order.
+pub(in crate::mesh) fn spans(bytes: &[u8]) -> Result<(ParsedMesh, Vec<Span>), ParseError> {
     let (text, binary) = container(bytes)?;
     let document = Document::read(text)?;
     let mut scene = Scene {
         document: &document,
         buffers: Buffers::new(&document, binary),
         polygons: Polygons::new(Vec::new()),
+        spans: Vec::new(),
         n_placed: 0,
         n_bytes: bytes.len() as u64,
     };
@@ -328,7 +368,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         let transform = level.transform * node.transform();
         if let Some(mesh) = node.mesh {
             let by = format_args!("nodes[{}].mesh", index.0);
-            scene.mesh(mesh, named(&document.meshes, mesh, "mesh", by)?, &transform)?;
+            let found = named(&document.meshes, mesh, "mesh", by)?;
+            scene.mesh(Some(index.0), mesh, found, &transform)?;
             n_meshes += 1;
         }
         levels.push(Level {
@@ -341,7 +382,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
     if document.scenes.is_empty() && document.nodes.is_empty() {
         // A file without nodes is a collection of meshes.
         for (i, mesh) in document.meshes.iter().enumerate() {
-            scene.mesh(Whole(i), mesh, &Matrix4::identity())?;
+            scene.mesh(None, Whole(i), mesh, &Matrix4::identity())?;
         }
     } else if n_meshes == 0 && !document.meshes.is_empty() {
         let why = format!(
@@ -350,7 +391,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<ParsedMesh, ParseError> {
         );
         return Err(fault("the scene that is read", why));
     }
-    scene.polygons.finish()
+    let spans = scene.spans;
+    Ok((scene.polygons.finish()?, spans))
 }
 
 #[cfg(test)]
