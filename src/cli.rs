@@ -8,7 +8,7 @@ mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
-pub(crate) use looking::{Top, View};
+pub(crate) use looking::{Top, Usd, View};
 pub(crate) use maps::{Map, Transfer};
 pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
 
@@ -119,6 +119,9 @@ pub(crate) enum Command {
     Labels(Labels),
     /// Write labels, or coloured meshes, of a collection to a folder
     Export(Export),
+    /// Label the meshes of OpenUSD assets, or correct labels there (needs the package coseg[usd])
+    #[command(disable_help_flag = true)]
+    Usd(Usd),
     /// Draw a collection in the colours of its labels as one PNG
     Render(Render),
     /// Write a collection with the viewer as one self-contained HTML file

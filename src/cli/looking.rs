@@ -2,6 +2,7 @@
 
 use super::OneCollection;
 use clap::Args;
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 /// `coseg view`
@@ -35,4 +36,12 @@ pub(crate) struct Top {
     /// Exit after this many updates
     #[arg(long, short = 'n', value_name = "N")]
     pub(crate) limit: Option<u64>,
+}
+
+/// `coseg usd`
+#[derive(Debug, Args)]
+pub(crate) struct Usd {
+    /// `label`, `correct` or `--help`, and their arguments
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, required = true)]
+    pub(crate) arguments: Vec<OsString>,
 }

@@ -42,6 +42,7 @@ pub(crate) mod synth;
 mod top;
 mod transfer;
 mod undo;
+mod usd;
 mod values;
 mod view;
 mod wait;
@@ -217,6 +218,7 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Completions { shell } => completions::run(*shell),
         Command::Man { out } => man::run(out.as_deref()),
         Command::Stop(args) => stop::run(args, session()?),
+        Command::Usd(args) => usd::run(args, &cli.global),
     }?;
     Ok(ExitCode::from(if done { 0 } else { exit::FAILED }))
 }

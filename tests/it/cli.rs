@@ -287,6 +287,19 @@ fn a_folder_becomes_labelled_shapes_and_files() {
 }
 
 #[test]
+fn usd_says_what_it_needs() {
+    let missing = "/nowhere/python3";
+    let mut command = coseg();
+    command.args(["usd", "label", "a.usd", "--collection", "c", "-o", "b.usda"]);
+    let output = command.env("COSEG_PYTHON", missing).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8(output.stderr).unwrap();
+    for part in [missing, "pip install 'coseg[usd]'", "COSEG_PYTHON"] {
+        assert!(text.contains(part), "{text}");
+    }
+}
+
+#[test]
 fn shapes_are_compared_named_and_removed() {
     let (home, folder) = home_with_folder();
     let _daemon = home.start();
