@@ -124,4 +124,7 @@ step "TypeScript: the tarball in a project of its own"
 )
 
 ./raw/run.sh
+
+step "Blender: the extension"
+PATH="$WORK/venv/bin:$PATH" ./blender/check.sh
 step "clients are well"
