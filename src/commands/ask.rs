@@ -244,8 +244,8 @@ mod tests {
     fn a_part_is_named_by_its_shape_and_number() {
         assert_eq!(part("a:b:3").unwrap(), ("a:b", 3));
         for wrong in ["a", "a:", "a:x", "a:-1"] {
-            let said = part(wrong).unwrap_err().to_string();
-            assert!(said.contains("SHAPE:NUMBER"), "{said}");
+            let message = part(wrong).unwrap_err().to_string();
+            assert!(message.contains("SHAPE:NUMBER"), "{message}");
         }
     }
 }

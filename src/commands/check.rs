@@ -61,7 +61,7 @@ fn report(
     if as_json {
         let list = findings
             .iter()
-            .map(|f| json!({ "place": f.place, "message": f.message, "damage": f.damage }));
+            .map(|f| json!({ "place": f.location, "message": f.message, "damage": f.damage }));
         let value = json!({
             "library": directory.display().to_string(),
             "ok": n_damaged == 0,
@@ -76,7 +76,7 @@ fn report(
     }
     for f in findings {
         let kind = if f.damage { "damage" } else { "note" };
-        print_line(&format!("{kind}: {}: {}", f.place, f.message))?;
+        print_line(&format!("{kind}: {}: {}", f.location, f.message))?;
     }
     if n_damaged == 0 {
         eprintln!("{}: no damage", directory.display());

@@ -55,7 +55,7 @@ pub(super) fn pool(
     let parts: Vec<Parts> = (0..granularities.len())
         .map(|g| Parts::new(shapes, merged.iter().map(|m| &m[g])))
         .collect();
-    let n_weightings = if shapes.learnt_metric {
+    let n_weightings = if shapes.learned_metric {
         1
     } else {
         WEIGHTINGS.len()
@@ -273,7 +273,7 @@ impl Parts {
         let mut at = 0;
         for (b, (values, share, weights)) in blocks.into_iter().enumerate() {
             let width = weights.len();
-            let as_a_whole = shapes.learnt_metric && b < 3;
+            let as_a_whole = shapes.learned_metric && b < 3;
             let columns: Vec<Column> = (0..width)
                 .map(|c| {
                     let values = self

@@ -15,7 +15,7 @@ use crate::segmentation::{PatchGraph, Surface};
 use rayon::prelude::*;
 
 /// Labellings from which a metric is learnt.
-const N_TEACHERS: usize = 10;
+const N_METRIC_SOURCES: usize = 10;
 /// Candidates that are refined face by face before the choice is made.
 const SHORTLIST: usize = 4;
 /// Rounds of classifier and cut, and the area share of change below which they stop.
@@ -93,7 +93,7 @@ pub(super) struct Prepared<'a> {
     pub(super) dim: usize,
     pub(super) up_known: bool,
     /// Whether the features are in a learnt metric, in which columns are comparable.
-    pub(super) learnt_metric: bool,
+    pub(super) learned_metric: bool,
     pub(super) means: Vec<f64>,
     /// Where the patches of each shape begin.
     pub(super) offsets: Vec<usize>,
@@ -118,7 +118,7 @@ impl<'a> Prepared<'a> {
             input,
             dim,
             up_known: input.up_known,
-            learnt_metric: false,
+            learned_metric: false,
             means,
             offsets,
             area,
@@ -264,9 +264,9 @@ fn choose(
     };
     let mut refined = refined_all(&candidates);
     let mut judge = Judge::new(criterion, candidates, &shapes.area, k);
-    let teachers = judge.best(&refined, N_TEACHERS);
-    let teachers: Vec<&Vec<u32>> = teachers.iter().map(|&c| &refined[c]).collect();
-    if let Some(metric) = patchwise.metric(&teachers, k) {
+    let sources = judge.best(&refined, N_METRIC_SOURCES);
+    let sources: Vec<&Vec<u32>> = sources.iter().map(|&c| &refined[c]).collect();
+    if let Some(metric) = patchwise.metric(&sources, k) {
         let features: Vec<Features> = shapes
             .each()
             .map(|s| in_metric(s.features, &metric))
@@ -282,7 +282,7 @@ fn choose(
             up_known: shapes.up_known,
         };
         let in_metric = Prepared {
-            learnt_metric: true,
+            learned_metric: true,
             ..Prepared::new(&input)
         };
         let more = pool(&in_metric, criterion, k, seed);

@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn separable_labels_are_learnt() {
+    fn separable_labels_are_classified() {
         let (x, a, y) = blobs(1);
         let classifier = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3).classifier();
         let p = classifier.log_probabilities(&x);
@@ -266,14 +266,14 @@ mod tests {
         let (x, a, y) = blobs(1);
         let three = Statistics::of_shape(&x, &a, |f| Some(y[f]), 3);
         let merged = Statistics::of_shape(&x, &a, |f| Some(y[f] / 2), 2);
-        let apart = |a: &[f64], b: &[f64]| {
+        let difference = |a: &[f64], b: &[f64]| {
             let pairs = a.iter().zip(b);
             pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         };
         let translated = three.translated(&[1.0, 0.0, 1.0, 0.0, 0.0, 1.0], 2);
-        assert!(apart(&translated.counts, &merged.counts) < 1e-12);
-        assert!(apart(&translated.sums, &merged.sums) < 1e-12);
-        assert!(apart(&translated.moment, &merged.moment) < 1e-12);
+        assert!(difference(&translated.counts, &merged.counts) < 1e-12);
+        assert!(difference(&translated.sums, &merged.sums) < 1e-12);
+        assert!(difference(&translated.moment, &merged.moment) < 1e-12);
         let halves = three.translated(&[0.5; 6], 2);
         assert!((halves.counts[0] - three.total() / 2.0).abs() < 1e-12);
     }

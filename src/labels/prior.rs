@@ -14,7 +14,7 @@ pub struct Pinned<'a> {
     pub surface: &'a Surface,
     /// Its standardised face descriptors.
     pub features: &'a Features,
-    /// Class of each face `(m,)`, none where the person said nothing.
+    /// Class of each face `(m,)`, none where the person translated nothing.
     pub classes: &'a [Option<u32>],
 }
 
@@ -126,8 +126,8 @@ mod tests {
         }
         assert!(prior.agreement > 0.8, "{}", prior.agreement);
         let other = &input.shapes[1];
-        let said = prior.probabilities(other.surface, other.features);
-        let right = said.chunks(2).zip(&strips.truth);
+        let translated = prior.probabilities(other.surface, other.features);
+        let right = translated.chunks(2).zip(&strips.truth);
         let right = right.filter(|(row, part)| row[usize::from(**part < 2)] > 0.5);
         assert_eq!(right.count(), strips.truth.len());
         // Somebody whose classes have nothing to do with the labels is not agreed with.

@@ -83,7 +83,7 @@ impl Library {
             return Ok(Vec::new());
         };
         let model = model.base_model();
-        let (latent, place) = self.latent(&stored, &standings)?;
+        let (latent, position) = self.latent(&stored, &standings)?;
         let mut done = Vec::new();
         for d in &wrong {
             let (from, to) = (self.store.known(d.from)?, self.store.known(d.to)?);
@@ -94,7 +94,7 @@ impl Library {
             };
             let shapes = [&from, &to].map(|k| PreparedShape::new(&self.store, k.file(), &model));
             let mut tries = vec![shapes[0].map_to(&shapes[1])];
-            if let (Some(x), Some(y)) = (place[i], place[j]) {
+            if let (Some(x), Some(y)) = (position[i], position[j]) {
                 let start = latent.through(x, y);
                 tries.push(shapes[0].map_grown_from(&shapes[1], (&start, stored.k)));
             }
@@ -142,10 +142,10 @@ impl Library {
             .collect();
         let linked = |s: usize| good.iter().any(|m| m.0 == s || m.1 == s);
         let order: Vec<usize> = (0..kept.shapes.len()).filter(|s| linked(*s)).collect();
-        let mut place = vec![None; kept.shapes.len()];
+        let mut position = vec![None; kept.shapes.len()];
         let mut values = Vec::with_capacity(order.len());
         for (p, &s) in order.iter().enumerate() {
-            place[s] = Some(p);
+            position[s] = Some(p);
             let known = self.store.known(kept.shapes[s])?;
             values.push(known.view().eigenvalues[..kept.k].to_vec());
         }
@@ -154,8 +154,8 @@ impl Library {
             .iter()
             .filter_map(|(from, to, c_12)| {
                 Some(Link {
-                    from: place[*from]?,
-                    to: place[*to]?,
+                    from: position[*from]?,
+                    to: position[*to]?,
                     c_12,
                     weight: 1.0,
                 })
@@ -174,7 +174,7 @@ impl Library {
                 .collect();
             latent.insert(values, &into);
         }
-        Ok((latent, place))
+        Ok((latent, position))
     }
 }
 

@@ -70,14 +70,16 @@ impl Library {
     }
 
     pub(super) fn item(&self, row: JobItemRow) -> Result<JobItem> {
-        let place = format!("job_items {}, {}", row.job, row.index);
+        let location = format!("job_items {}, {}", row.job, row.index);
         let detail = || {
             row.detail_json
                 .as_deref()
-                .ok_or_else(|| damaged(&place, "no detail"))
+                .ok_or_else(|| damaged(&location, "no detail"))
         };
         let attempts = match (row.status, &row.detail_json) {
-            (ItemStatus::Queued, Some(detail)) => from_json::<Attempts>(detail, &place)?.attempts,
+            (ItemStatus::Queued, Some(detail)) => {
+                from_json::<Attempts>(detail, &location)?.attempts
+            }
             _ => 0,
         };
         let state = match row.status {
@@ -86,8 +88,8 @@ impl Library {
                 let stage = running.get(&(row.job, row.index)).cloned();
                 stage.map_or(ItemState::Queued, ItemState::Running)
             }
-            ItemStatus::Done => ItemState::Done(Box::new(from_json(detail()?, &place)?)),
-            ItemStatus::Failed => ItemState::Failed(from_json(detail()?, &place)?),
+            ItemStatus::Done => ItemState::Done(Box::new(from_json(detail()?, &location)?)),
+            ItemStatus::Failed => ItemState::Failed(from_json(detail()?, &location)?),
             ItemStatus::Cancelled => ItemState::Cancelled,
         };
         Ok(JobItem {

@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_seen_is_refused_and_shown() {
-        for (name, told) in [
+        for (name, readable) in [
             ("chair\u{202e}fbo", "chair\\u{202e}fbo"),
             ("\u{2066}chair\u{2069}", "\\u{2066}chair\\u{2069}"),
             ("chair\u{200f}", "chair\\u{200f}"),
@@ -163,12 +163,12 @@ mod tests {
             ("\u{3164}", "\\u{3164}"),
         ] {
             let e = check_name("shape", name, 255).unwrap_err().to_string();
-            assert!(e.contains(told) && e.contains("U+"), "{e}");
+            assert!(e.contains(readable) && e.contains("U+"), "{e}");
             assert!(
                 e.chars()
                     .all(|c| !name.contains(c) || c.is_ascii() || c == '椅' || c == '子')
             );
-            assert_eq!(shown(name), told);
+            assert_eq!(shown(name), readable);
         }
         for name in ["", ".", "..", "a/b", "a\nb", "a\u{85}b"] {
             assert!(check_name("shape", name, 255).is_err(), "{name:?}");

@@ -17,7 +17,7 @@ use super::types::{LabelId, RequestKey};
 use super::verdict::ReviewState;
 use crate::description::DescriptionView;
 use crate::labels::{Normalisation, Statistics};
-use crate::pipeline::{AskedShape, Background, Question, ShapeParts, next_question};
+use crate::pipeline::{Background, CandidateShape, Question, ShapeParts, next_question};
 use crate::store::{LabelRow, PassedPart, ShapeId};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -104,7 +104,7 @@ impl Answer {
 const PASSED: [&str; 2] = ["skip", "cut"];
 
 /// A shape among whose parts the next question is chosen.
-struct Asked {
+struct Candidate {
     /// Index in the collection.
     at: usize,
     parts: Arc<ShapeParts>,
@@ -152,10 +152,10 @@ impl Library {
                     .catalog()
                     .read(|r| r.passed_parts(collection.id()))?,
             };
-            let asked = self.asked(collection, &pins, &used, &passed_over)?;
-            let shapes: Vec<AskedShape<'_>> = asked
+            let candidates = self.candidates(collection, &pins, &used, &passed_over)?;
+            let shapes: Vec<CandidateShape<'_>> = candidates
                 .iter()
-                .map(|a| AskedShape {
+                .map(|a| CandidateShape {
                     parts: &a.parts,
                     labelled: &a.labelled,
                     open: &a.open,
@@ -169,12 +169,12 @@ impl Library {
             let question = next_question(&shapes, &known).ok_or_else(nothing)?;
             let labels = self.store.labels(collection.id())?;
             let likeliest = offered(&question, &used, found.labels, &labels);
-            let with_area = |a: &Asked| -> u64 {
+            let with_area = |a: &Candidate| -> u64 {
                 let k = used.len().max(1);
                 let answered = a.labelled.chunks_exact(k);
                 answered.filter(|row| row.iter().any(|x| *x > 0.0)).count() as u64
             };
-            let shape = &asked[question.shape];
+            let shape = &candidates[question.shape];
             let known = self.store.known(collection.shapes()[shape.at].id)?;
             let view = known.view();
             let faces = faces_of(&view, &shape.parts, question.part);
@@ -189,7 +189,7 @@ impl Library {
                 doubt: question.doubt,
                 gain: question.gain,
                 likeliest,
-                n_answered: asked.iter().map(with_area).sum(),
+                n_answered: candidates.iter().map(with_area).sum(),
             })
         })
     }
@@ -306,13 +306,13 @@ impl Library {
 
     /// The shapes among whose parts the next question is chosen: those of the least digests, with
     /// answers and without.
-    fn asked(
+    fn candidates(
         &self,
         collection: &Collection,
         pins: &BTreeMap<usize, Vec<i32>>,
         used: &[LabelId],
         passed_over: &[PassedPart],
-    ) -> Result<Vec<Asked>> {
+    ) -> Result<Vec<Candidate>> {
         let all = collection.representatives(collection.shapes().len());
         let (with, without): (Vec<usize>, Vec<usize>) =
             all.into_iter().partition(|at| pins.contains_key(at));
@@ -352,7 +352,7 @@ impl Library {
                         *slot = false;
                     }
                 }
-                Ok(Asked {
+                Ok(Candidate {
                     at,
                     parts,
                     labelled,

@@ -310,8 +310,8 @@ impl Library {
             let rows = r.events_since(collection, sequence, limit)?;
             rows.into_iter()
                 .map(|e| {
-                    let place = format!("events {collection}, {}", e.sequence);
-                    let kind: EventKind = from_json(&e.payload_json, &place)?;
+                    let location = format!("events {collection}, {}", e.sequence);
+                    let kind: EventKind = from_json(&e.payload_json, &location)?;
                     Ok(Event {
                         sequence: e.sequence,
                         kind,
@@ -356,7 +356,7 @@ fn labels(row: LabelVersionRow) -> Labels {
 }
 
 fn shape_info(row: ShapeRow, review: Review) -> Result<ShapeInfo> {
-    let place = format!("shapes {}", row.name);
+    let location = format!("shapes {}", row.name);
     Ok(ShapeInfo {
         ordinal: row.ordinal,
         version: row.version,
@@ -364,9 +364,9 @@ fn shape_info(row: ShapeRow, review: Review) -> Result<ShapeInfo> {
         n_polygons: row.n_polygons,
         area: row.area,
         content_digest: row.content_digest.to_string(),
-        report: report_from_json(&row.report_json, &place)?,
-        parts: from_json(&row.parts_json, &place)?,
-        sources: from_json(&row.sources_json, &place)?,
+        report: report_from_json(&row.report_json, &location)?,
+        parts: from_json(&row.parts_json, &location)?,
+        sources: from_json(&row.sources_json, &location)?,
         stored_bytes: row.stored_bytes,
         review,
         name: row.name,

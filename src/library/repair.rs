@@ -85,7 +85,7 @@ impl Library {
     /// The description and the signature of one shape.
     fn repair_shape(&self, collection: &CollectionRow, shape: &ShapeRow) -> Result<Vec<String>> {
         let mut done = Vec::new();
-        let place = format!("{}/{}", collection.name, shape.name);
+        let location = format!("{}/{}", collection.name, shape.name);
         let object = object(
             &self.store,
             ObjectKind::Description,
@@ -109,7 +109,7 @@ impl Library {
                 let name = name(&description.report);
                 if name != shape.description_digest {
                     done.push(format!(
-                        "{place}: {}: made by another version or on another kind of processor; \
+                        "{location}: {}: made by another version or on another kind of processor; \
                          remove the shape and add it again",
                         object.file
                     ));
@@ -123,7 +123,7 @@ impl Library {
                 self.store
                     .catalog()
                     .write(|tx| -> Result<()> { Ok(tx.insert_object(&again)?) })?;
-                done.push(format!("{place}: {} was computed again", again.file));
+                done.push(format!("{location}: {} was computed again", again.file));
                 self.store.objects().open_description(&again)?
             }
             Err(e) => return Err(e.into()),
@@ -138,7 +138,7 @@ impl Library {
                 .catalog()
                 .write(|tx| -> Result<()> { Ok(tx.put_signature(shape.id, &signature)?) })?;
             done.push(format!(
-                "{place}: its signature was taken from its description"
+                "{location}: its signature was taken from its description"
             ));
         }
         Ok(done)

@@ -83,7 +83,7 @@ impl Library {
             }
         }
         let farthest = pairs.iter().copied().fold(0.0, f64::max);
-        let to_exemplar: Vec<f64> = open
+        let to_training: Vec<f64> = open
             .iter()
             .map(|s| {
                 let all = corrected().map(|e| metric.distance(&s.signature, &e.signature));
@@ -91,7 +91,7 @@ impl Library {
             })
             .collect();
         let need = |t: usize| uncertainty[t].max(LEAST_NEED);
-        let nearer = |c: usize, t: usize| (to_exemplar[t] - pairs[c * n + t]).max(0.0);
+        let nearer = |c: usize, t: usize| (to_training[t] - pairs[c * n + t]).max(0.0);
         let gains: Vec<f64> = (0..n)
             .map(|c| (0..n).map(|t| need(t) * nearer(c, t)).sum())
             .collect();

@@ -68,7 +68,7 @@ impl Library {
         let is_same = collection.shapes().is_empty() || in_force == Some(found.axis);
         let is_supervised = collection.state().regime.supervision().is_some();
         let change = if is_same || is_supervised {
-            relearned(collection, &self.store, found, is_same)?
+            without_clustering(collection, &self.store, found, is_same)?
         } else {
             let chosen = collection.representatives(MAX_REPRESENTATIVES);
             relabel_all(&self.store, collection, &chosen)?;
@@ -90,7 +90,7 @@ impl Library {
 /// What changes where nothing is clustered. `is_same`: labels stay, because there are no shapes, or
 /// the same axis is in force as before; otherwise they follow from the training shapes, once the
 /// model is fitted along the new axis.
-fn relearned(
+fn without_clustering(
     collection: &Collection,
     sources: &dyn Sources,
     found: UpFound,

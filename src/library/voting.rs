@@ -7,7 +7,9 @@ use super::sources::{FileView, Known, Sources};
 use super::types::Source;
 use crate::fmap::{Confidence, FunctionalMap, MapOptions};
 use crate::labels::LabelModel;
-use crate::pipeline::{DescriptionView, Labelling, Prepared, Vote, map, map_from, unlikeness};
+use crate::pipeline::{
+    DescriptionView, Labelling, Prepared, Vote, descriptor_distance, map, map_from,
+};
 use crate::store::{MapRow, ShapeId};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -249,7 +251,7 @@ pub(super) fn rank_candidates(
     let compared = nearest.into_par_iter().map(|at| {
         let known = sources.arrays(collection.shapes()[at].id)?;
         let known = sources.prepared(known.view(), model);
-        Ok((unlikeness(&known, &shape), at))
+        Ok((descriptor_distance(&known, &shape), at))
     });
     let mut found: Vec<(f64, usize)> = compared.collect::<Result<_>>()?;
     found.sort_by(|a, b| a.0.total_cmp(&b.0));

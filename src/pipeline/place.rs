@@ -1,5 +1,5 @@
 //! A description and a snapshot of the library become labels: carried through functional maps from a few known
-//! shapes, weighed against what the collection has learnt of its labels, and cut along creases.
+//! shapes, weighed against what the collection has fitted of its labels, and cut along creases.
 
 use super::DescriptionView;
 use crate::fmap::{
@@ -95,7 +95,7 @@ pub fn map_by_descriptors(
 /// How unlike a known shape is to another, by whatever vertices of it look most alike: mean squared descriptor difference
 /// between some vertices of the shape and the most alike of some of the known one. Predicts which maps carry labels well,
 /// without one. About `2 · 200 · 600 · dim` flops.
-pub fn unlikeness(known: &Prepared, shape: &Prepared) -> f64 {
+pub fn descriptor_distance(known: &Prepared, shape: &Prepared) -> f64 {
     const N_COMPARED: (usize, usize) = (600, 200);
     let dim = shape.features.dim;
     let some = |x: &[f32], count: usize| -> Vec<f32> {
@@ -194,8 +194,8 @@ pub fn label(
         .statistics
         .classifier()
         .log_probabilities(&prepared.features);
-    let (carried, weights) = carried(shape, votes, k);
-    let unary = blended(&log_model, &carried, VOTE_SHARE, k);
+    let (voted, weights) = vote_probabilities(shape, votes, k);
+    let unary = blended(&log_model, &voted, VOTE_SHARE, k);
     let classes = cut(&prepared.surface, &unary, k, STRENGTH, None);
     let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();
     for row in posterior.chunks_exact_mut(k) {
@@ -207,16 +207,16 @@ pub fn label(
 
 /// What each class of each face costs `(m, k)`: the log-linear mean of the carried votes, of this share, and the label
 /// model's `log_model`; the latter alone where nothing was carried.
-pub(super) fn blended(log_model: &[f64], carried: &[f64], share: f64, k: usize) -> Vec<f64> {
+pub(super) fn blended(log_model: &[f64], voted: &[f64], share: f64, k: usize) -> Vec<f64> {
     let mut unary = Vec::with_capacity(log_model.len());
     for (f, row) in log_model.chunks_exact(k).enumerate() {
-        let votes = carried.get(f * k..(f + 1) * k).unwrap_or_default();
+        let votes = voted.get(f * k..(f + 1) * k).unwrap_or_default();
         let any = votes.iter().any(|p| *p > 0.0);
         unary.extend(row.iter().enumerate().map(|(l, log)| {
-            let learnt = -log.max(FLOOR.ln());
+            let fitted = -log.max(FLOOR.ln());
             match any {
-                true => -share * votes[l].max(FLOOR).ln() + (1.0 - share) * learnt,
-                false => learnt,
+                true => -share * votes[l].max(FLOOR).ln() + (1.0 - share) * fitted,
+                false => fitted,
             }
         }));
     }
@@ -225,7 +225,11 @@ pub(super) fn blended(log_model: &[f64], carried: &[f64], share: f64, k: usize) 
 
 /// Label probabilities of each face `(m, k)` by the votes, 0 where nothing corresponds, and the share of each vote in all
 /// of them.
-pub fn carried(shape: &DescriptionView<'_>, votes: &[Vote<'_>], k: usize) -> (Vec<f64>, Vec<f64>) {
+pub fn vote_probabilities(
+    shape: &DescriptionView<'_>,
+    votes: &[Vote<'_>],
+    k: usize,
+) -> (Vec<f64>, Vec<f64>) {
     if votes.is_empty() {
         return (Vec::new(), Vec::new());
     }

@@ -87,7 +87,7 @@ impl ShapeParts {
 
 /// A shape whose parts may be asked for.
 #[derive(Debug, Clone, Copy)]
-pub struct AskedShape<'a> {
+pub struct CandidateShape<'a> {
     /// Its parts.
     pub parts: &'a ShapeParts,
     /// Area that a person gave to each class in each part `(p, k)`, in shares of the shape.
@@ -125,7 +125,7 @@ pub struct Question {
 
 /// The part whose answer is worth most; `None` if none is open. Costs the square of the number of
 /// parts.
-pub fn next_question(shapes: &[AskedShape<'_>], known: &Background<'_>) -> Option<Question> {
+pub fn next_question(shapes: &[CandidateShape<'_>], known: &Background<'_>) -> Option<Question> {
     if !shapes.iter().any(|s| s.open.contains(&true)) {
         return None;
     }
@@ -185,7 +185,7 @@ struct PartModel {
 }
 
 impl PartModel {
-    fn new(shapes: &[AskedShape<'_>], known: &Background<'_>) -> Self {
+    fn new(shapes: &[CandidateShape<'_>], known: &Background<'_>) -> Self {
         let raw = Features {
             data: shapes
                 .iter()
@@ -297,7 +297,7 @@ struct Patches {
 }
 
 impl Patches {
-    fn new(shapes: &[AskedShape<'_>], features: &Features, known: &Background<'_>) -> Self {
+    fn new(shapes: &[CandidateShape<'_>], features: &Features, known: &Background<'_>) -> Self {
         let (k, n) = (known.k, known.discovered.counts.len());
         let classifier = known.discovered.classifier().at_temperature(TEMPERATURE);
         let log = classifier.log_probabilities(features);
@@ -369,7 +369,7 @@ fn largest(row: &[f64]) -> usize {
 
 /// Area that a person gave to each class in each patch `(n_patches, k)`: what a part has, spread
 /// over its patches.
-fn labelled_patches(shapes: &[AskedShape<'_>], k: usize) -> Vec<f64> {
+fn labelled_patches(shapes: &[CandidateShape<'_>], k: usize) -> Vec<f64> {
     let mut out = Vec::new();
     for shape in shapes {
         let mut area = vec![0.0; shape.parts.n_parts()];

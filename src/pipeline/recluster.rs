@@ -86,8 +86,8 @@ pub fn recluster(
         ..
     } = &together;
     let current = old.map(|model| current_classes(shapes, model));
-    let there = current.as_deref().zip(old.map(|m| m.labels.len()));
-    let found = discover(&input, &options.discovery, there);
+    let current_input = current.as_deref().zip(old.map(|m| m.labels.len()));
+    let found = discover(&input, &options.discovery, current_input);
     let (old_score, new_score) = (found.current_value, found.value);
     let accepted = new_score > old_score + options.min_gain;
     let (labels, classes, changes) = match (accepted, current, old) {

@@ -22,7 +22,7 @@ use std::path::Path;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     /// The file, relative to the library, or the table and key.
-    pub place: String,
+    pub location: String,
     /// The fault.
     pub message: String,
     /// Whether data are lost or wrong. It is false for orphans that the next sweep removes, and for
@@ -126,20 +126,20 @@ struct Findings {
 }
 
 impl Findings {
-    fn damage(&mut self, place: impl Into<String>, message: impl Into<String>) {
-        let (place, message) = (place.into(), message.into());
-        if self.seen.insert((place.clone(), message.clone())) {
+    fn damage(&mut self, location: impl Into<String>, message: impl Into<String>) {
+        let (location, message) = (location.into(), message.into());
+        if self.seen.insert((location.clone(), message.clone())) {
             self.list.push(Finding {
-                place,
+                location,
                 message,
                 damage: true,
             });
         }
     }
 
-    fn note(&mut self, place: String, message: String) {
+    fn note(&mut self, location: String, message: String) {
         self.list.push(Finding {
-            place,
+            location,
             message,
             damage: false,
         });
@@ -161,11 +161,11 @@ impl Findings {
     }
 
     /// Runs one part; an error that stops it becomes a finding, and the next part runs.
-    fn take(&mut self, place: &str, part: impl FnOnce(&mut Self) -> Result<(), StoreError>) {
+    fn take(&mut self, location: &str, part: impl FnOnce(&mut Self) -> Result<(), StoreError>) {
         match part(self) {
             Ok(()) => {}
             Err(StoreError::Catalog(error)) => {
-                self.damage(place, format!("cannot be read: {error}"));
+                self.damage(location, format!("cannot be read: {error}"));
             }
             Err(error) => self.error(&error),
         }
@@ -282,13 +282,13 @@ fn check_shapes(
         let Some(Some(shape)) = findings.keep(reader.shape(id)) else {
             continue;
         };
-        let place = format!("shapes {id}");
+        let location = format!("shapes {id}");
         for (kind, digest) in [
             (ObjectKind::Original, shape.content_digest),
             (ObjectKind::Description, shape.description_digest),
         ] {
             if let Some(None) = findings.keep(reader.object(kind, &digest)) {
-                findings.damage(&place, format!("no object {digest} of kind {kind:?}"));
+                findings.damage(&location, format!("no object {digest} of kind {kind:?}"));
             }
         }
         // A description that cannot be opened was already found with its file.
@@ -296,12 +296,12 @@ fn check_shapes(
         if let Some(described) = described.filter(|d| d.n_polygons != shape.n_polygons) {
             let (row, file) = (shape.n_polygons, described.n_polygons);
             findings.damage(
-                &place,
+                &location,
                 format!("{row} polygons, but its description has {file}"),
             );
         }
         if let Some(None) = findings.keep(reader.signature(id)) {
-            findings.damage(&place, "no signature");
+            findings.damage(&location, "no signature");
         }
         findings.keep(reader.stats(id));
         findings.keep(reader.area_shares(id));
@@ -316,7 +316,7 @@ fn check_labels(
     described: Option<&Arrays>,
     findings: &mut Findings,
 ) {
-    let place = format!("shapes {}", shape.id);
+    let location = format!("shapes {}", shape.id);
     let Some(versions) = findings.keep(reader.kept_versions(shape.id)) else {
         return;
     };
@@ -326,14 +326,14 @@ fn check_labels(
             "version {}, but the newest labels are {newest:?}",
             shape.version
         );
-        findings.damage(&place, message);
+        findings.damage(&location, message);
     }
     // Versions before the newest ones are kept if undoing a correction needs them.
     let first = shape.version.saturating_sub(KEPT_LABEL_VERSIONS - 1);
     let is_gap = |pair: &[u64]| pair[1] != pair[0] + 1 && pair[1] > first;
     if versions.windows(2).any(is_gap) {
         findings.damage(
-            &place,
+            &location,
             format!("versions of its labels are missing among {versions:?}"),
         );
     }
@@ -444,15 +444,15 @@ fn check_maps(
 }
 
 /// Checks that a pointwise map leads from the `n2` vertices of one shape to the `n1` of another.
-fn check_p2p(findings: &mut Findings, place: &str, p2p_21: &[u32], (n1, n2): (usize, usize)) {
+fn check_p2p(findings: &mut Findings, location: &str, p2p_21: &[u32], (n1, n2): (usize, usize)) {
     if p2p_21.len() != n2 {
         let found = p2p_21.len();
         let text = format!("p2p_21 has {found} vertices, but the shape has {n2}");
-        findings.damage(place, text);
+        findings.damage(location, text);
     }
     if let Some(vertex) = p2p_21.iter().find(|&&vertex| vertex as usize >= n1) {
         let text = format!("p2p_21 names vertex {vertex}, but there are {n1}");
-        findings.damage(place, text);
+        findings.damage(location, text);
     }
 }
 
@@ -474,14 +474,14 @@ fn check_collections(
             [id],
             |row| row.get(0),
         )?;
-        let place = format!("collections {id}");
+        let location = format!("collections {id}");
         for (what, largest, next) in [
             ("label", largest_label, u64::from(collection.next_label)),
             ("ordinal", largest_ordinal, collection.next_ordinal),
         ] {
             if let Some(largest) = largest.filter(|&largest| largest >= next) {
                 findings.damage(
-                    &place,
+                    &location,
                     format!("its next {what} is {next}, but {largest} is in use"),
                 );
             }

@@ -40,10 +40,10 @@ fn answers_pin_parts_and_name_labels_that_are_then_offered() {
     let (_folder, library) = library(3, Up::Unknown);
     stream(&library, &shapes);
     let mut ids = BTreeMap::<u32, u32>::new();
-    let mut asked = BTreeSet::new();
+    let mut questions = BTreeSet::new();
     for n in 0..8 {
         let question = ask(&library);
-        assert!(asked.insert((question.shape.clone(), question.part)));
+        assert!(questions.insert((question.shape.clone(), question.part)));
         assert_eq!(question.n_answered, n);
         assert!(question.likeliest.len() <= 3 && !question.likeliest.is_empty());
         assert!((0.0..=1.0).contains(&question.doubt), "{question:?}");
@@ -78,7 +78,7 @@ fn answers_pin_parts_and_name_labels_that_are_then_offered() {
     for _ in 0..8 {
         let undone = library.undo(COLLECTION, None).unwrap();
         assert_eq!(undone.change, "answer");
-        assert!(asked.iter().any(|(shape, _)| *shape == undone.subject));
+        assert!(questions.iter().any(|(shape, _)| *shape == undone.subject));
     }
     for shape in &shapes {
         assert_eq!(review(&library, &shape.name), ReviewState::Unseen);
@@ -131,8 +131,8 @@ fn a_part_that_does_not_exist_is_refused() {
     stream(&library, &shapes);
     let part = (shapes[0].name.as_str(), 400);
     let refused = library.answer(COLLECTION, part, &Answer::Label(0), "", None);
-    let said = refused.unwrap_err().to_string();
-    assert!(said.contains("part 400 is named"), "{said}");
+    let message = refused.unwrap_err().to_string();
+    assert!(message.contains("part 400 is named"), "{message}");
     let unnamed = Answer::Named(String::new());
     let part = (shapes[0].name.as_str(), 0);
     assert!(

@@ -94,13 +94,13 @@ fn no_daemon_exits_3_in_time_and_says_so() {
     let begin = Instant::now();
     let output = home.coseg(&["ls", "--timeout", "0.3"]);
     assert_eq!(output.status.code(), Some(3));
-    let said = stderr(&output);
+    let message = stderr(&output);
     let expected = format!(
         "coseg: no answer from {} within 0.3 s; is a daemon running there?\n  \
          start one with `coseg serve`, or give its address with --endpoint\n",
         home.endpoint()
     );
-    assert_eq!(said, expected);
+    assert_eq!(message, expected);
     assert!(begin.elapsed() >= Duration::from_millis(300));
 }
 
@@ -331,11 +331,11 @@ fn shapes_are_compared_named_and_removed() {
     let kinds: Vec<&str> = labels.split_whitespace().collect();
     assert_eq!(text.lines().count(), 736);
     assert!(text.lines().all(|l| l == "-1" || kinds.contains(&l)));
-    let told = json(
+    let report = json(
         &home.coseg(&[&transfer[..], &["--json", "-o", &carried]].concat()),
         0,
     );
-    assert_eq!(told["rows"], 736);
+    assert_eq!(report["rows"], 736);
     let numpy = std::fs::read(&carried).unwrap();
     assert_eq!(numpy.len(), 128 + 4 * 736);
     std::fs::write(&given, "1 2\n3\n").unwrap();
@@ -398,12 +398,15 @@ fn one_refused_shape_fails_the_command_and_not_the_others() {
     let bad = home.mesh("bad.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n");
     let output = home.coseg(&["add", &bad, &good]);
     assert_eq!(output.status.code(), Some(1));
-    let said = stderr(&output);
+    let message = stderr(&output);
     assert!(
-        said.contains("coseg: bad: face 0 names vertex 9, but the mesh has 3\n"),
-        "{said}"
+        message.contains("coseg: bad: face 0 names vertex 9, but the mesh has 3\n"),
+        "{message}"
     );
-    assert!(said.contains("default: 1 added, 1 failed in "), "{said}");
+    assert!(
+        message.contains("default: 1 added, 1 failed in "),
+        "{message}"
+    );
     // Other bytes under the same name are refused, or replace the shape.
     home.mesh("good.off", &skittle(1));
     let taken = json(&home.coseg(&["add", &good, "--json"]), 1);

@@ -19,16 +19,16 @@ fn correct(library: &Library, shape: &Labelled) {
         .unwrap();
 }
 
-fn carry(library: &Library) {
+fn propagate(library: &Library) {
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
 }
 
 /// Share of the faces of the other shapes that have the known label, by id.
-fn right(library: &Library, shapes: &[Labelled], but: &[&str]) -> f64 {
+fn right(library: &Library, shapes: &[Labelled], except: &[&str]) -> f64 {
     let found = all_labels(library);
     let others: Vec<&Labelled> = shapes
         .iter()
-        .filter(|s| !but.contains(&s.name.as_str()))
+        .filter(|s| !except.contains(&s.name.as_str()))
         .collect();
     let share = |s: &&Labelled| {
         let labels = &found[&s.name];
@@ -62,7 +62,7 @@ fn one_corrected_shape_labels_all_others_by_its_ids() {
         .unwrap();
     assert_eq!(done.n_faces as usize, chosen.labels.len());
     assert_eq!((done.n_stale, done.changed_share > 0.99), (6, true));
-    carry(&library);
+    propagate(&library);
 
     let score = right(&library, &shapes[..7], &[&chosen.name]);
     assert!(score > 0.85, "{score:.3} of the faces are right by id");
@@ -108,7 +108,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     };
     let mut states = vec![snapshot(&library)];
     correct(&library, &shapes[0]);
-    carry(&library);
+    propagate(&library);
     states.push(snapshot(&library));
     library.name_label(COLLECTION, 11, "jaw", None).unwrap();
     // An unfinished propagation can be undone.
@@ -134,7 +134,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     stream(&library, &shapes[5..]);
     let last = undo();
     assert_eq!((last.change.as_str(), last.n_left), ("correct", 0));
-    carry(&library);
+    propagate(&library);
     let mut now = snapshot(&library);
     let newcomer = now.remove(&shapes[5].name).unwrap();
     assert_eq!(now, states[0]);
@@ -152,7 +152,7 @@ fn undo_goes_back_to_the_first_labels_to_the_byte() {
     );
     // The collection remains usable.
     correct(&library, &shapes[2]);
-    carry(&library);
+    propagate(&library);
     assert!(right(&library, &shapes, &[&shapes[2].name]) > 0.8);
 }
 
@@ -170,7 +170,7 @@ fn pinned_faces_never_change_by_themselves() {
     library
         .correct(COLLECTION, &shapes[1].name, &some, None)
         .unwrap();
-    carry(&library);
+    propagate(&library);
     let kept = |library: &Library| {
         let labels = &all_labels(library)[&shapes[1].name];
         faces.iter().all(|f| labels[*f as usize] == 77)
@@ -215,7 +215,7 @@ fn the_same_correction_again_has_one_effect_and_the_same_reply() {
     let correction = Correction::Whole(truth(&shapes[0]));
     let once = || library.correct(COLLECTION, &shapes[0].name, &correction, Some(&key));
     let first = once().unwrap();
-    carry(&library);
+    propagate(&library);
     let after = sequence(&library);
     assert_eq!(once().unwrap(), first);
     assert_eq!(sequence(&library), after);
@@ -309,7 +309,7 @@ fn a_part_is_corrected_as_a_whole() {
         (done.area_share - part.area_share).abs() < 0.05,
         "{done:?} {part:?}"
     );
-    carry(&library);
+    propagate(&library);
     let there = all_labels(&library)[name]
         .iter()
         .filter(|l| **l == 40)
@@ -347,7 +347,7 @@ fn a_wholly_labelled_coarse_shape_keeps_no_label_that_nobody_gave() {
         assert_eq!(used, BTreeSet::from([10, 11]), "{when}");
         let n_parts = library.shape(COLLECTION, "a").unwrap().parts.len();
         assert_eq!(n_parts, 2, "{when}");
-        carry(&library);
+        propagate(&library);
     }
 }
 
@@ -364,7 +364,7 @@ fn a_correction_whose_shape_is_removed_at_once_leaves_all_labels() {
             assert!(library.relabel_next(Some(COLLECTION)).unwrap());
         }
         library.remove(COLLECTION, &shapes[0].name, None).unwrap();
-        carry(&library);
+        propagate(&library);
         before.remove(&shapes[0].name);
         assert_eq!(all_labels(&library), before, "after {n_steps} steps");
         stream(&library, &shapes[4..]);
@@ -379,7 +379,7 @@ fn labels_are_merged_and_split_on_all_shapes() {
     let (_folder, library) = library(3, Up::Unknown);
     stream(&library, &shapes);
     correct(&library, &shapes[0]);
-    carry(&library);
+    propagate(&library);
     let before = all_labels(&library);
     let (into, n) = library.merge_labels(COLLECTION, 10, 11, None).unwrap();
     assert_eq!((into.id, into.n_shapes), (11, 6));
@@ -401,7 +401,7 @@ fn labels_are_merged_and_split_on_all_shapes() {
     let since = sequence(&library);
     let (new, n) = library.split_label(COLLECTION, 11, None).unwrap();
     assert!(n > 0 && new.id > 12, "{new:?}");
-    carry(&library);
+    propagate(&library);
     let split = EventKind::LabelSplit {
         from: 11,
         into: vec![new.id],
@@ -427,7 +427,7 @@ fn an_addition_after_a_correction_computes_few_maps_and_relabels_nobody() {
     for s in &shapes[..4] {
         correct(&library, s);
     }
-    carry(&library);
+    propagate(&library);
     let before = all_labels(&library);
     let placed = library
         .add(COLLECTION, file(&shapes[7].name, &shapes[7].mesh))
@@ -447,16 +447,16 @@ fn when_the_correction_is_carried_makes_no_difference() {
         for s in &shapes[..2] {
             correct(&library, s);
             if eager {
-                carry(&library);
+                propagate(&library);
             }
         }
         for s in &shapes[6..] {
             library.add(COLLECTION, file(&s.name, &s.mesh)).unwrap();
             if eager {
-                carry(&library);
+                propagate(&library);
             }
         }
-        carry(&library);
+        propagate(&library);
         drop(folder);
         all_labels(&library)
     };
@@ -477,7 +477,7 @@ fn the_next_suggestion_is_never_one_that_was_corrected() {
             &library,
             shapes.iter().find(|s| s.name == next.shape).unwrap(),
         );
-        carry(&library);
+        propagate(&library);
     }
     let none = library.suggest(COLLECTION).unwrap_err().to_string();
     assert_eq!(
@@ -492,10 +492,10 @@ fn without_its_exemplar_a_collection_keeps_its_labels() {
     let (_folder, library) = library(3, Up::Unknown);
     stream(&library, &shapes[..5]);
     correct(&library, &shapes[0]);
-    carry(&library);
+    propagate(&library);
     let mut before = all_labels(&library);
     library.remove(COLLECTION, &shapes[0].name, None).unwrap();
-    carry(&library);
+    propagate(&library);
     before.remove(&shapes[0].name);
     assert_eq!(all_labels(&library), before);
     stream(&library, &shapes[5..]);
@@ -514,7 +514,7 @@ fn any_order_of_arrival_ends_within_a_point_of_the_batch() {
                 correct(&library, &shapes[0]);
             }
         }
-        carry(&library);
+        propagate(&library);
         right(&library, &shapes, &[&shapes[0].name])
     };
     // Compares corrections after all shapes are known with corrections of the first shape of a

@@ -136,7 +136,7 @@ impl Home {
             child,
             notify,
             lines,
-            said: Vec::new(),
+            printed: Vec::new(),
             endpoint: self.endpoint(),
         }
     }
@@ -148,7 +148,7 @@ pub(crate) struct Daemon {
     pub(crate) notify: UnixDatagram,
     lines: mpsc::Receiver<String>,
     /// Lines of stderr so far.
-    pub(crate) said: Vec<String>,
+    pub(crate) printed: Vec<String>,
     pub(crate) endpoint: String,
 }
 
@@ -174,8 +174,9 @@ impl Daemon {
     pub(crate) fn await_line(&mut self, text: &str) -> String {
         loop {
             let line = self.lines.recv_timeout(DEADLINE);
-            let line = line.unwrap_or_else(|e| panic!("no {text:?} ({e}) after {:#?}", self.said));
-            self.said.push(line.clone());
+            let line =
+                line.unwrap_or_else(|e| panic!("no {text:?} ({e}) after {:#?}", self.printed));
+            self.printed.push(line.clone());
             if line.contains(text) {
                 return line;
             }
@@ -203,9 +204,9 @@ impl Daemon {
         let status = self.child.wait().unwrap();
         let _ = over_in.send(());
         guard.join().unwrap();
-        let mut said = std::mem::take(&mut self.said);
-        said.extend(self.lines.iter());
-        (status, said)
+        let mut printed = std::mem::take(&mut self.printed);
+        printed.extend(self.lines.iter());
+        (status, printed)
     }
 }
 

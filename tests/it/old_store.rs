@@ -112,10 +112,10 @@ fn a_library_of_a_later_version_is_refused_and_left_as_it_is() {
         "{refused}"
     );
     let home = crate::harness::Home { dir };
-    let (status, said) = home.spawn(&[], &[]).ended();
+    let (status, printed) = home.spawn(&[], &[]).ended();
     assert!(!status.success());
     let message = format!("has store format {later}, this version reads {CATALOG_FORMAT}");
-    assert!(said.iter().any(|l| l.contains(&message)), "{said:?}");
+    assert!(printed.iter().any(|l| l.contains(&message)), "{printed:?}");
     assert_eq!(std::fs::read(path.join("catalog.db")).unwrap(), before);
 }
 

@@ -9,7 +9,7 @@ use coseg::library::{
 };
 use coseg::mesh::write::off;
 use coseg::mesh::{Format, TriMesh, parse};
-use coseg::pipeline::{Params, describe, literal};
+use coseg::pipeline::{Params, describe, yang_tian_baseline};
 use coseg::synth::{Family, Labelled, Options, family};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -322,14 +322,17 @@ fn the_paper_taken_literally_gives_equal_shapes_equal_labels() {
     };
     let described = [of(&shapes[0]), of(&shapes[1]), of(&shapes[0])];
     let views: Vec<_> = described.iter().map(|d| d.view()).collect();
-    let labels = literal(&views, 3, 1).unwrap();
-    assert_eq!(labels, literal(&views, 3, 1).unwrap());
+    let labels = yang_tian_baseline(&views, 3, 1).unwrap();
+    assert_eq!(labels, yang_tian_baseline(&views, 3, 1).unwrap());
     assert_eq!(labels[0], labels[2]);
     for (found, view) in labels.iter().zip(&views) {
         assert_eq!(found.len(), view.faces.len());
         assert!((0..3).all(|l| found.contains(&l)) && found.iter().all(|l| *l < 3));
     }
-    assert_eq!(literal(&[], 3, 1).unwrap(), Vec::<Vec<u32>>::new());
+    assert_eq!(
+        yang_tian_baseline(&[], 3, 1).unwrap(),
+        Vec::<Vec<u32>>::new()
+    );
 }
 
 #[test]

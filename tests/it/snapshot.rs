@@ -213,25 +213,25 @@ fn what_a_killed_copy_left_is_taken_over_and_nothing_else() {
     let other = std::fs::File::open(&partial).unwrap();
     rustix::fs::flock(&other, rustix::fs::FlockOperation::LockExclusive).unwrap();
     let refused = snapshot();
-    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert_eq!(refused.status.code(), Some(1), "{said}");
-    assert!(said.contains("another process is writing"), "{said}");
+    let message = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1), "{message}");
+    assert!(message.contains("another process is writing"), "{message}");
     drop(other);
     // It contains files that no copy leaves.
     let mine = partial.join("mine.txt");
     std::fs::write(&mine, "mine").unwrap();
     let refused = snapshot();
-    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert_eq!(refused.status.code(), Some(1), "{said}");
+    let message = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1), "{message}");
     assert!(
-        said.contains("contains files that no copy leaves"),
-        "{said}"
+        message.contains("contains files that no copy leaves"),
+        "{message}"
     );
     assert!(partial.join("objects/ab/half").exists());
     std::fs::remove_file(mine).unwrap();
     let done = snapshot();
-    let said = String::from_utf8_lossy(&done.stderr).into_owned();
-    assert!(done.status.success(), "{said}");
+    let message = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.success(), "{message}");
     assert!(!partial.exists() && !copy.join("objects/ab/half").exists());
     // A folder that another user has replaced by a link is not written through.
     let elsewhere = home.path("elsewhere");

@@ -97,9 +97,9 @@ fn health_and_metrics_are_told() {
     let dashboard = include_str!("../../config/grafana/dashboard.json");
     let dashboard: serde_json::Value = serde_json::from_str(dashboard).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
-    let asked = panels.iter().flat_map(|p| p["targets"].as_array().unwrap());
+    let targets = panels.iter().flat_map(|p| p["targets"].as_array().unwrap());
     let is_name = |c: char| c.is_alphanumeric() || c == '_';
-    for query in asked.map(|t| t["expr"].as_str().unwrap()) {
+    for query in targets.map(|t| t["expr"].as_str().unwrap()) {
         for name in query
             .split(|c| !is_name(c))
             .filter(|w| w.starts_with("coseg_"))
@@ -134,8 +134,11 @@ fn only_the_page_itself_may_change_anything() {
         own.replace(&host, "host: example.org\r\n"),
         own.replace(&host, ""),
     ] {
-        let (status, said) = name(&headers);
-        assert!(status == 403 || status == 400, "{headers}: {status} {said}");
+        let (status, reply) = name(&headers);
+        assert!(
+            status == 403 || status == 400,
+            "{headers}: {status} {reply}"
+        );
     }
     let shown = || json(&home.coseg(&["show", "-c", "skittles", "--json"]), 0);
     assert!(shown()["labels"][0]["name"].is_null());
@@ -242,14 +245,14 @@ fn a_collection_becomes_one_page() {
     let daemon = home.start();
     fill(&daemon);
     let file = home.path("page.html").display().to_string();
-    let told = json(&home.coseg(&["view", "-o", &file, "--json"]), 0);
+    let report = json(&home.coseg(&["view", "-o", &file, "--json"]), 0);
     let page = std::fs::read_to_string(&file).unwrap();
-    assert_eq!(told["n_shapes"], 2);
-    assert_eq!(told["n_bytes"], page.len());
+    assert_eq!(report["n_shapes"], 2);
+    assert_eq!(report["n_bytes"], page.len());
     assert_eq!(page.matches("data-kind=\"functions\"").count(), 2);
     assert_eq!(
         page.matches("data-kind=\"map\"").count(),
-        told["n_maps"].as_u64().unwrap() as usize
+        report["n_maps"].as_u64().unwrap() as usize
     );
     let less = [
         "view",
@@ -264,12 +267,12 @@ fn a_collection_becomes_one_page() {
         "0",
         "--json",
     ];
-    let told = json(&home.coseg(&less), 0);
+    let report = json(&home.coseg(&less), 0);
     assert_eq!(
-        (&told["n_shapes"], &told["n_left_out"]),
+        (&report["n_shapes"], &report["n_left_out"]),
         (&1.into(), &1.into())
     );
-    assert!((told["n_bytes"].as_u64().unwrap() as usize) < page.len());
+    assert!((report["n_bytes"].as_u64().unwrap() as usize) < page.len());
     // The same library gives the same page.
     let text = |name: &str| {
         let path = home.path(name).display().to_string();
@@ -329,11 +332,11 @@ fn shells_and_manuals_know_every_command() {
 fn an_address_that_others_reach_must_be_allowed() {
     let home = Home::new();
     let refused = home.spawn(&["--http", "0.0.0.0:0"], &[]);
-    let (status, said) = refused.ended();
+    let (status, printed) = refused.ended();
     assert_eq!(status.code(), Some(2));
     assert!(
-        said.iter().any(|l| l.contains("http.allow_remote")),
-        "{said:?}"
+        printed.iter().any(|l| l.contains("http.allow_remote")),
+        "{printed:?}"
     );
 }
 
@@ -372,11 +375,11 @@ fn beyond_this_machine_a_token_opens_what_there_is() {
         "/metrics",
         "/x",
     ] {
-        let (status, head, said) = ask(path, "");
+        let (status, head, reply) = ask(path, "");
         assert_eq!(status, 401, "{path}");
-        assert!(head.contains("www-authenticate: bearer") && said.contains("?token="));
-        let (status, _, said) = ask(path, "authorization: Bearer 0123456789abcdef\r\n");
-        assert!(status == 401 && !said.contains("skittles"), "{path}");
+        assert!(head.contains("www-authenticate: bearer") && reply.contains("?token="));
+        let (status, _, reply) = ask(path, "authorization: Bearer 0123456789abcdef\r\n");
+        assert!(status == 401 && !reply.contains("skittles"), "{path}");
     }
     assert_eq!(ask("/?token=0123456789abcdef", "").0, 401);
     assert_eq!(ask(&format!("/api/library?token={token}"), "").0, 401);
@@ -391,8 +394,8 @@ fn beyond_this_machine_a_token_opens_what_there_is() {
         "{cookie}"
     );
     let cookie = format!("cookie: {}\r\n", cookie.split(';').next().unwrap());
-    let (status, _, said) = ask("/api/library", &cookie);
-    assert!(status == 200 && said.contains("skittles"), "{said}");
+    let (status, _, reply) = ask("/api/library", &cookie);
+    assert!(status == 200 && reply.contains("skittles"), "{reply}");
     assert!(ask("/", &cookie).2.contains("viewer.js"));
     // A client with the cookie still needs the header for a change, as on loopback.
     let name = |headers: &str| {
@@ -427,14 +430,14 @@ fn a_token_file_is_asked_for_on_loopback_too() {
     };
     let path = file.display().to_string();
     let env = [("COSEG__HTTP__TOKEN_FILE", path.as_str())];
-    for (text, mode, said) in [
+    for (text, mode, expected) in [
         ("short", 0o600, "16 to 512"),
         ("a-secret-of-people", 0o644, "can be read by others"),
     ] {
         write(text, mode);
         let (status, lines) = home.spawn(&["--http", "127.0.0.1:0"], &env).ended();
         assert_eq!(status.code(), Some(2));
-        assert!(lines.iter().any(|l| l.contains(said)), "{lines:?}");
+        assert!(lines.iter().any(|l| l.contains(expected)), "{lines:?}");
     }
     write("a-secret-of-people", 0o600);
     let (_daemon, address) = served(&home, &env);

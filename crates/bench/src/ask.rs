@@ -137,11 +137,11 @@ fn play(
     let mut question = next(&mut session)?;
     let mut n_answered = 0;
     for &count in counts {
-        while let Some(asked) = question.take_if(|_| n_answered < count) {
-            let (label, wrong) = truth(category, &asked)?;
+        while let Some(current) = question.take_if(|_| n_answered < count) {
+            let (label, wrong) = truth(category, &current)?;
             run.wrong_share += wrong;
             let begin = Instant::now();
-            let id = answer(&mut session, &asked, label, ids.get(&label).copied())?;
+            let id = answer(&mut session, &current, label, ids.get(&label).copied())?;
             ids.insert(label, id);
             question = next(&mut session)?;
             run.seconds.push(begin.elapsed().as_secs_f64());

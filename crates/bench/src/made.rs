@@ -33,7 +33,7 @@ impl Change {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Masked {
     pub(crate) missing: usize,
-    pub(crate) said: usize,
+    pub(crate) reported: usize,
     pub(crate) found: usize,
     pub(crate) all: usize,
 }
@@ -44,9 +44,9 @@ impl Masked {
     pub(crate) fn figures(&self) -> [f64; 3] {
         let share = |a: usize, b: usize| a as f64 / b.max(1) as f64;
         [
-            share(self.found, self.said),
+            share(self.found, self.reported),
             share(self.found, self.missing),
-            share(self.said, self.all),
+            share(self.reported, self.all),
         ]
     }
 }
@@ -109,7 +109,7 @@ fn count(masked: &mut Masked, map: &PointMap, missing: &[Option<bool>]) {
         let Some(missing) = missing else { continue };
         masked.all += 1;
         masked.missing += usize::from(*missing);
-        masked.said += usize::from(!matched);
+        masked.reported += usize::from(!matched);
         masked.found += usize::from(*missing && !matched);
     }
 }

@@ -1,7 +1,7 @@
 //! `coseg-bench` compares labels and maps with known ones, and measures time.
 
 mod ask;
-mod carry;
+mod transfer;
 mod error;
 mod labels;
 mod made;

@@ -4,7 +4,7 @@
 use crate::error::{BenchError, Outcome};
 use crate::made::{self, Change};
 use crate::print::{print_line, table};
-use crate::{Global, carry};
+use crate::{Global, transfer};
 use clap::Args;
 use coseg::SpectralMesh;
 use coseg::fmap::{EstimateOptions, PointMap, PointShape, Side, point_maps};
@@ -79,7 +79,7 @@ pub(crate) struct Score {
 
 pub(crate) fn run(args: &BenchMaps, global: &Global) -> Outcome {
     if let Some(labels) = &args.labels {
-        return carry::run(labels, &args.category, global);
+        return transfer::run(labels, &args.category, global);
     }
     let mut rows = Vec::new();
     let mut scores = Vec::new();

@@ -1,9 +1,9 @@
 //! Measures whether maps recognise missing parts: labels are transferred from shapes that lack a
 //! part.
 
-use crate::carry::{Labelled, Ready, labelled};
 use crate::error::BenchError;
 use crate::stream::{Category, Known};
+use crate::transfer::{Labelled, Ready, labelled};
 use coseg::fmap::MapOptions;
 use coseg::mesh::write::off;
 use coseg::mesh::{FaceGeometry, Format, TriMesh};
@@ -28,9 +28,9 @@ pub(crate) struct Mask {
     /// Area without counterpart.
     missing: f64,
     /// Area that is reported as without counterpart.
-    said: f64,
+    reported: f64,
     /// Area that is reported as such although nothing was cut off.
-    said_of_whole: f64,
+    reported_of_whole: f64,
 }
 
 impl Mask {
@@ -39,8 +39,8 @@ impl Mask {
             n_maps: a.n_maps + b.n_maps,
             found: a.found + b.found,
             missing: a.missing + b.missing,
-            said: a.said + b.said,
-            said_of_whole: a.said_of_whole + b.said_of_whole,
+            reported: a.reported + b.reported,
+            reported_of_whole: a.reported_of_whole + b.reported_of_whole,
         };
         masks.iter().fold(Self::default(), add)
     }
@@ -49,9 +49,9 @@ impl Mask {
         let n = self.n_maps.max(1) as f64;
         [
             self.missing / n,
-            self.found / self.said.max(1e-300),
+            self.found / self.reported.max(1e-300),
             self.found / self.missing.max(1e-300),
-            self.said_of_whole / n,
+            self.reported_of_whole / n,
         ]
     }
 
@@ -153,12 +153,12 @@ fn masked(cut: &Labelled, (s, class): (usize, u32), prep: &Ready, n: usize) -> M
             for v in face {
                 let area = f64::from(to.0.mass[*v as usize]) / around[*v as usize];
                 let missing = *truth == Some(class);
-                let said = !partial.confidence.is_matched(*v as usize);
+                let reported = !partial.confidence.is_matched(*v as usize);
                 mask.missing += if missing { area } else { 0.0 };
-                mask.said += if said { area } else { 0.0 };
-                mask.found += if missing && said { area } else { 0.0 };
+                mask.reported += if reported { area } else { 0.0 };
+                mask.found += if missing && reported { area } else { 0.0 };
                 if !full.confidence.is_matched(*v as usize) {
-                    mask.said_of_whole += area;
+                    mask.reported_of_whole += area;
                 }
             }
         }

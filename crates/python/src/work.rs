@@ -76,10 +76,10 @@ pub(crate) fn interruptible<T: Send + 'static>(
                 return done.map_err(|failure| failure.raise(py));
             }
             Err(mpsc::RecvTimeoutError::Timeout) => {
-                let told = py
+                let called = py
                     .check_signals()
                     .and_then(|()| report(py, &control, progress.as_ref()));
-                if let Err(error) = told {
+                if let Err(error) = called {
                     control.is_cancelled.store(true, Ordering::Relaxed);
                     return Err(error);
                 }

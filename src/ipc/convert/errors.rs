@@ -81,8 +81,8 @@ pub fn failure(f: &Failure) -> Error {
     }
 }
 
-fn subject(place: FailureSubject) -> Subject {
-    match place {
+fn subject(location: FailureSubject) -> Subject {
+    match location {
         FailureSubject::Face(i) => Subject::Face(i),
         FailureSubject::Vertex(i) => Subject::Vertex(i),
         FailureSubject::Line(i) => Subject::Line(i),

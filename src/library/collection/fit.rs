@@ -18,7 +18,9 @@ use crate::library::rows::damaged;
 use crate::library::sources::{Known, Sources};
 use crate::library::types::LabelId;
 use crate::library::voting::{IncomingMap, PreparedShape, new_map};
-use crate::pipeline::{DescriptionView, Given, Lesson, LessonMap, Prepared, TeachOptions, teach};
+use crate::pipeline::{
+    DescriptionView, FitMap, FitOptions, FitShape, FurtherEvidence, Prepared, fit,
+};
 use crate::segmentation::Surface;
 use crate::store::LabelRow;
 use rayon::prelude::*;
@@ -231,20 +233,20 @@ impl Fit<'_> {
             .par_iter()
             .map(|m| self.sources.prepared(m.known.file(), &model))
             .collect();
-        let lessons: Vec<Lesson<'_>> = members
+        let fit_shapes: Vec<FitShape<'_>> = members
             .iter()
             .zip(&views)
             .zip(&prepared)
-            .map(|((m, shape), prepared)| Lesson {
+            .map(|((m, shape), prepared)| FitShape {
                 shape: *shape,
                 prepared,
                 pinned: &m.pinned_classes,
                 discovered: &m.discovered,
             })
             .collect();
-        let maps: Vec<LessonMap<'_>> = maps
+        let maps: Vec<FitMap<'_>> = maps
             .iter()
-            .map(|(from, to, m)| LessonMap {
+            .map(|(from, to, m)| FitMap {
                 from: *from,
                 to: *to,
                 p2p: m.p2p_21(),
@@ -253,12 +255,12 @@ impl Fit<'_> {
             .collect();
         let statistics = self.evidence_elsewhere(&model)?;
         let discovered = self.discovered_statistics(&model)?;
-        let given = Given {
+        let further = FurtherEvidence {
             statistics: &statistics,
-            n_exemplars: self.n_training(&members)?,
+            n_training: self.n_training(&members)?,
             discovered: discovered.as_ref(),
         };
-        let fitted = teach(&lessons, &maps, &given, k, &TeachOptions::default());
+        let fitted = fit(&fit_shapes, &maps, &further, k, &FitOptions::default());
         model.statistics = fitted.statistics;
         let model = ModelState {
             prior: fitted.prior,
@@ -385,7 +387,7 @@ impl Fit<'_> {
     fn evidence_elsewhere(&self, model: &LabelModel) -> Result<Statistics> {
         let (k, dim) = (model.labels.len(), model.normalisation.mean.len());
         let mut evidence = Statistics::empty(k, dim);
-        let options = TeachOptions::default();
+        let options = FitOptions::default();
         for (at, shape) in self.collection.shapes().iter().enumerate() {
             let is_training = shape.pinned && !self.chosen.contains(&at);
             let version = self.supervision.discovered().version_of(shape.ordinal);

@@ -16,7 +16,7 @@ use crate::library::voting::{
     IncomingMap, PreparedShape, Voted, Voter, new_map, new_maps, one_hot, rank_candidates,
     sources_of, votes,
 };
-use crate::pipeline::{Labelling, TeachOptions, label_taught};
+use crate::pipeline::{FitOptions, Labelling, label_fitted};
 use crate::store::ShapeId;
 use rayon::prelude::*;
 
@@ -224,7 +224,7 @@ fn voters(
         &|at| !shapes[at].pinned && is_trained(at),
         MAX_MAPS - training.len(),
     )?;
-    let trust = TeachOptions::default().exemplar_trust;
+    let trust = FitOptions::default().training_trust;
     let mut voters = Vec::new();
     for at in training.into_iter().chain(others) {
         let known = sources.known(shapes[at].id)?;
@@ -277,8 +277,8 @@ fn labelled(
 ) -> Labelling {
     let fitted = (&model.model.statistics, model.prior.as_ref());
     let votes = votes(voters, maps);
-    let options = TeachOptions::default();
-    label_taught(
+    let options = FitOptions::default();
+    label_fitted(
         &shape.view,
         &shape.prepared,
         fitted,

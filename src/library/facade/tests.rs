@@ -259,7 +259,7 @@ fn what_uses_a_deleted_collection_is_told_so() {
     let shape = library.shape(COLLECTION, "a").expect("there");
     assert_eq!(shape.n_polygons as usize, parsed.n_polygons);
 
-    let told = |work: &dyn Fn(&mut Collection) -> Result<()>| {
+    let outcome = |work: &dyn Fn(&mut Collection) -> Result<()>| {
         let row = library.collection_row(COLLECTION).expect("there");
         let error = library.with_collection(row, |collection| {
             library.delete_collection(COLLECTION, None)?;
@@ -271,11 +271,11 @@ fn what_uses_a_deleted_collection_is_told_so() {
         add(&library, "a", tiny, false).expect("added again");
         error.expect_err("it is gone")
     };
-    let writes = told(&|collection| {
+    let writes = outcome(&|collection| {
         let change = crate::library::change::Change::default();
         crate::library::change::commit(&library.store, collection, change, |_, _| Ok(()))
     });
-    let reads = told(&|collection| {
+    let reads = outcome(&|collection| {
         let id = collection.shapes()[0].id;
         crate::library::sources::Sources::known(&library.store, id).map(|_| ())
     });

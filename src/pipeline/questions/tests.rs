@@ -61,7 +61,7 @@ fn chairs() -> Vec<ShapeParts> {
 }
 
 /// The question after these answers: shape, part, class.
-fn asked(
+fn question_after(
     shapes: &[ShapeParts],
     answers: &[(usize, u32, usize)],
     passed: &[(usize, u32)],
@@ -82,11 +82,11 @@ fn asked(
     for &(shape, part) in passed {
         open[shape][part as usize] = false;
     }
-    let all: Vec<AskedShape<'_>> = shapes
+    let all: Vec<CandidateShape<'_>> = shapes
         .iter()
         .zip(&labelled)
         .zip(&open)
-        .map(|((parts, labelled), open)| AskedShape {
+        .map(|((parts, labelled), open)| CandidateShape {
             parts,
             labelled,
             open,
@@ -102,7 +102,7 @@ fn asked(
 
 #[test]
 fn the_first_question_is_of_the_kind_with_most_area() {
-    let question = asked(&chairs(), &[], &[], 0).unwrap();
+    let question = question_after(&chairs(), &[], &[], 0).unwrap();
     assert_eq!(question.part, 0, "{question:?}");
     assert!(
         (question.doubt - 1.0).abs() < 1e-9,
@@ -116,19 +116,19 @@ fn the_first_question_is_of_the_kind_with_most_area() {
 #[test]
 fn an_answer_decides_parts_like_it_and_the_next_question_is_of_another_kind() {
     let chairs = chairs();
-    let first = asked(&chairs, &[], &[], 0).unwrap();
+    let first = question_after(&chairs, &[], &[], 0).unwrap();
     let answers = [(first.shape, first.part, 0)];
-    let second = asked(&chairs, &answers, &[], 1).unwrap();
+    let second = question_after(&chairs, &answers, &[], 1).unwrap();
     assert_eq!(second.part, 1, "{second:?}");
     assert!(second.gain < first.gain);
     let answers = [answers[0], (second.shape, second.part, 1)];
-    let third = asked(&chairs, &answers, &[], 2).unwrap();
+    let third = question_after(&chairs, &answers, &[], 2).unwrap();
     assert_eq!((third.shape, third.part), (2, 2), "{third:?}");
     // Nobody has named the third discovered label, which is that of the arm: class 2 + 2.
     assert_eq!(third.likeliest[0].0, 4, "{third:?}");
     // With its name, the legs that are left are certain.
     let answers = [answers[0], answers[1], (2, 2, 2)];
-    let fourth = asked(&chairs, &answers, &[], 3).unwrap();
+    let fourth = question_after(&chairs, &answers, &[], 3).unwrap();
     assert!(fourth.doubt < 0.5, "{fourth:?}");
     let expected = usize::from(fourth.part == 1);
     assert_eq!(fourth.likeliest[0].0, expected, "{fourth:?}");
@@ -138,7 +138,7 @@ fn an_answer_decides_parts_like_it_and_the_next_question_is_of_another_kind() {
 #[test]
 fn a_part_that_seems_to_be_of_two_kinds_is_not_asked_about_first() {
     let mixed = |area| shape(&[(area, &[LEG, SEAT]), (1.0 - area, &[LEG])]);
-    let question = asked(&[mixed(0.52), mixed(0.52)], &[], &[], 0).unwrap();
+    let question = question_after(&[mixed(0.52), mixed(0.52)], &[], &[], 0).unwrap();
     assert_eq!(question.part, 1, "{question:?}");
 }
 
@@ -146,19 +146,19 @@ fn a_part_that_seems_to_be_of_two_kinds_is_not_asked_about_first() {
 fn parts_that_are_closed_are_never_asked_about() {
     let chairs = chairs();
     let mut passed = Vec::new();
-    while let Some(question) = asked(&chairs, &[], &passed, 0) {
+    while let Some(question) = question_after(&chairs, &[], &passed, 0) {
         assert!(!passed.contains(&(question.shape, question.part)));
         passed.push((question.shape, question.part));
     }
     assert_eq!(passed.len(), 7, "each part once");
-    assert_eq!(asked(&[], &[], &[], 0), None);
+    assert_eq!(question_after(&[], &[], &[], 0), None);
 }
 
 #[test]
 fn the_same_shapes_ask_the_same_question() {
     let answers = [(0, 0, 0), (1, 1, 1)];
-    let one = asked(&chairs(), &answers, &[], 2);
-    assert_eq!(one, asked(&chairs(), &answers, &[], 2));
+    let one = question_after(&chairs(), &answers, &[], 2);
+    assert_eq!(one, question_after(&chairs(), &answers, &[], 2));
 }
 
 #[test]

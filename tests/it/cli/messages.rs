@@ -19,13 +19,13 @@ fn a_folder_with_bad_and_double_names_adds_the_rest() {
         (&added["n_added"], &added["n_failed"]),
         (&3.into(), &3.into())
     );
-    let said = stderr(&output);
+    let message = stderr(&output);
     for part in [
         "a\\nb.off: the shape name \"a\\nb\" has '\\n'",
         "c\\td.off: the shape name \"c\\td\" has '\\t'",
         "9.stl: would be named \"9\", as ",
     ] {
-        assert!(said.contains(part), "{part}: {said}");
+        assert!(message.contains(part), "{part}: {message}");
     }
 
     std::fs::create_dir_all(within("more/deep")).unwrap();
@@ -57,14 +57,14 @@ fn sizes_have_units_and_the_key_that_raises_the_limit() {
     let n = skittle(0).len();
     let output = home.coseg(&["add", &mesh]);
     assert_eq!(output.status.code(), Some(1));
-    let said = stderr(&output);
+    let message = stderr(&output);
     let size = format!(
         "m: the file has {:.1} KiB ({n} bytes), the limit is 16 KiB ",
         n as f64 / 1024.0
     );
     assert!(
-        said.contains(&size) && said.contains("limits.max_shape"),
-        "{said}"
+        message.contains(&size) && message.contains("limits.max_shape"),
+        "{message}"
     );
 }
 
@@ -76,7 +76,7 @@ fn a_wrong_name_hears_what_was_probably_meant() {
         &home.coseg(&["add", &folder, "-c", "skittles", "--parts", "2"]),
         0,
     );
-    for (args, said) in [
+    for (args, message) in [
         (
             &["show", "-c", "skitles"][..],
             "no collection named \"skitles\"; did you mean \"skittles\"?",
@@ -98,7 +98,7 @@ fn a_wrong_name_hears_what_was_probably_meant() {
         let output = home.coseg(args);
         assert_eq!(output.status.code(), Some(1), "{args:?}");
         assert!(
-            stderr(&output).contains(said),
+            stderr(&output).contains(message),
             "{args:?}: {}",
             stderr(&output)
         );
@@ -199,10 +199,10 @@ fn a_default_folder_that_others_may_enter_is_not_trusted() {
         );
         if status == 2 {
             let path = folder.display();
-            let said = format!("{path} has mode {mode:04o}, which lets others enter");
+            let message = format!("{path} has mode {mode:04o}, which lets others enter");
             let cure = format!("`chmod 700 {path}` mends that");
             let text = stderr(&output);
-            assert!(text.contains(&said) && text.contains(&cure), "{text}");
+            assert!(text.contains(&message) && text.contains(&cure), "{text}");
         }
     }
     // The folder of a service may let a group in, but not let it create sockets there.

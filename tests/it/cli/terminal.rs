@@ -105,17 +105,20 @@ fn an_interrupted_addition_says_what_goes_on_and_how_to_cancel_it() {
     kill_process(Pid::from_child(&child), Signal::INT).unwrap();
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.signal(), Some(Signal::INT.as_raw()));
-    let said = stderr(&output);
+    let message = stderr(&output);
     assert!(
-        said.contains("the daemon continues with the accepted work"),
-        "{said}"
+        message.contains("the daemon continues with the accepted work"),
+        "{message}"
     );
-    assert!(said.contains("to follow: coseg wait -c \"c\""), "{said}");
-    let line = said
+    assert!(
+        message.contains("to follow: coseg wait -c \"c\""),
+        "{message}"
+    );
+    let line = message
         .lines()
         .find_map(|l| l.trim().strip_prefix("to cancel: coseg "));
     let cancel: Vec<&str> = line.expect("how to cancel").split(' ').collect();
-    assert!(cancel.len() >= 2 && cancel[0] == "cancel", "{said}");
+    assert!(cancel.len() >= 2 && cancel[0] == "cancel", "{message}");
 
     let cancelled = home.coseg(&cancel);
     stdout(&cancelled, 0);
@@ -155,7 +158,7 @@ fn stopping_says_what_is_waited_for_and_waits() {
     assert_eq!(output.status.code(), Some(3));
 
     let daemon = home.start();
-    let told = json(&home.coseg(&["stop", "--no-wait", "--json"]), 0);
-    assert_eq!(told["ended"], false);
+    let report = json(&home.coseg(&["stop", "--no-wait", "--json"]), 0);
+    assert_eq!(report["ended"], false);
     assert_eq!(daemon.ended().0.code(), Some(0));
 }

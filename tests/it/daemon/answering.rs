@@ -32,7 +32,7 @@ fn ask(endpoint: &str, request: &wire::Request) -> Result<reply::Result, wire::E
     }
 }
 
-fn asked(body: Body, deadline_ms: u64) -> wire::Request {
+fn request_of(body: Body, deadline_ms: u64) -> wire::Request {
     wire::Request {
         request_id: "asked".to_owned(),
         deadline_ms,
@@ -131,7 +131,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
     ] {
         for body in requests(kind) {
             let what = format!("{kind}: {body:?}");
-            let error = ask(&daemon.endpoint, &asked(body, 0)).expect_err(&what);
+            let error = ask(&daemon.endpoint, &request_of(body, 0)).expect_err(&what);
             assert_eq!(
                 (error.code(), error.reason()),
                 (code, reason),
@@ -148,12 +148,12 @@ fn what_poisons_an_answer_costs_that_request_alone() {
     let endpoint = daemon.endpoint.as_str();
     std::thread::scope(|scope| {
         let endless = [map("loop", 20), correction("loop")]
-            .map(|body| scope.spawn(|| ask(endpoint, &asked(body, 0))));
+            .map(|body| scope.spawn(|| ask(endpoint, &request_of(body, 0))));
         let begin = Instant::now();
         while n_workers(&daemon) < 3 && begin.elapsed() < Duration::from_secs(5) {
             std::thread::sleep(Duration::from_millis(20));
         }
-        ask(&daemon.endpoint, &asked(map("b", 30), 0)).unwrap();
+        ask(&daemon.endpoint, &request_of(map("b", 30), 0)).unwrap();
         assert!(!endless.iter().any(|e| e.is_finished()));
         for answer in endless {
             let error = answer.join().unwrap().unwrap_err();
@@ -162,7 +162,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
         }
     });
     // Requests of vanished clients no longer occupy a processor.
-    let error = ask(&daemon.endpoint, &asked(map("loop", 21), 300)).unwrap_err();
+    let error = ask(&daemon.endpoint, &request_of(map("loop", 21), 300)).unwrap_err();
     assert_eq!(error.reason(), ErrorReason::Deadline, "{error:?}");
     let begin = Instant::now();
     // At most two workers each for describing, placing and answering.
@@ -173,7 +173,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
     // Nothing was changed, and all changes are possible.
     assert_eq!(super::events_since(client, "c").len(), events);
     assert_eq!(pid(client), daemon.child.id());
-    ask(&daemon.endpoint, &asked(correction("b"), 0)).unwrap();
+    ask(&daemon.endpoint, &request_of(correction("b"), 0)).unwrap();
     wait_idle(client, "c");
 }
 
@@ -202,7 +202,7 @@ fn a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again() {
     let named = |deadline_ms: u64| wire::Request {
         client_id: "somebody".to_owned(),
         request_id: "once".to_owned(),
-        ..asked(correction("slow"), deadline_ms)
+        ..request_of(correction("slow"), deadline_ms)
     };
     let begin = Instant::now();
     let late = ask(&daemon.endpoint, &named(400)).unwrap_err();
@@ -214,7 +214,7 @@ fn a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again() {
     assert!(took < Duration::from_millis(1500), "{took:?}");
     println!("a deadline of 400 ms was answered after {took:?}");
     // A change that waits behind it has not begun when its deadline passes, and is not made later.
-    let behind = ask(&daemon.endpoint, &asked(correction("a"), 200)).unwrap_err();
+    let behind = ask(&daemon.endpoint, &request_of(correction("a"), 200)).unwrap_err();
     assert!(behind.message.contains("was not begun"), "{behind:?}");
     let Ok(reply::Result::CorrectLabels(done)) = ask(&daemon.endpoint, &named(0)) else {
         panic!("not told")
@@ -232,7 +232,7 @@ fn a_change_that_outlasts_its_deadline_goes_on_and_is_told_to_who_asks_again() {
     };
     assert_eq!(corrected(client), 1);
     // Without a request id it cannot be repeated, but it continues nevertheless.
-    let unnamed = ask(&daemon.endpoint, &asked(correction("slow"), 400)).unwrap_err();
+    let unnamed = ask(&daemon.endpoint, &request_of(correction("slow"), 400)).unwrap_err();
     assert!(
         unnamed.message.ends_with("the change goes on"),
         "{unnamed:?}"

@@ -74,13 +74,13 @@ fn correct(client: &mut Client, shape: &str, labels: &[i32]) -> wire::CorrectLab
 }
 
 /// Least share of right faces over all shapes but one.
-fn worst(found: &BTreeMap<String, Vec<i32>>, but: &str) -> f64 {
+fn worst(found: &BTreeMap<String, Vec<i32>>, except: &str) -> f64 {
     let truth = truth();
     let right = |labels: &Vec<i32>| {
         let hits = labels.iter().zip(&truth).filter(|(l, t)| l == t).count();
         hits as f64 / truth.len() as f64
     };
-    let others = found.iter().filter(|(name, _)| *name != but);
+    let others = found.iter().filter(|(name, _)| *name != except);
     others.map(|(_, labels)| right(labels)).fold(1.0, f64::min)
 }
 

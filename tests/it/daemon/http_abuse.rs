@@ -121,11 +121,11 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
     let correct = |shape: &str, n: u64, runs: &str| {
         let body =
             format!(r#"{{"collection":"c","shape":"{shape}","n_polygons":{n},"runs":[{runs}]}}"#);
-        let (status, _, said) = exchange(address, "POST /api/correct", &host, &body);
-        (status, String::from_utf8(said).unwrap())
+        let (status, _, reply) = exchange(address, "POST /api/correct", &host, &body);
+        (status, String::from_utf8(reply).unwrap())
     };
     let n = SKITTLE_FACES as u64;
-    for (shape, n, runs, said) in [
+    for (shape, n, runs, expected) in [
         ("none", 10_000_000, "[0,10000000,1]", "NO_SHAPE"),
         (
             "a",
@@ -154,7 +154,7 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
     ] {
         let (status, text) = correct(shape, n, runs);
         assert!(status == 400 || status == 404, "{runs}: {status}");
-        assert!(text.contains(said), "{runs}: {text}");
+        assert!(text.contains(expected), "{runs}: {text}");
     }
     // As many faces as a body may have, each over the whole shape, from several pages at once.
     let runs = format!("[0,{n},1],").repeat(500_000);
@@ -173,18 +173,18 @@ fn runs_without_end_are_refused_and_freeze_nothing() {
     assert_eq!(correct("a", n, "[0,10,1]").0, 200);
     // The daemon ends on request even if pages continue to send requests.
     let body = format!(r#"{{"collection":"c","shape":"a","n_polygons":{n},"runs":[{runs}]}}"#);
-    let asked = format!("{}{body}", post(address, "/api/correct", body.len()));
+    let request = format!("{}{body}", post(address, "/api/correct", body.len()));
     let pages: Vec<_> = (0..4)
         .map(|_| {
-            let (mut stream, asked) = (TcpStream::connect(address).unwrap(), asked.clone());
-            std::thread::spawn(move || stream.write_all(asked.as_bytes()).map(|()| stream))
+            let (mut stream, request) = (TcpStream::connect(address).unwrap(), request.clone());
+            std::thread::spawn(move || stream.write_all(request.as_bytes()).map(|()| stream))
         })
         .collect();
     let crowd = crowd(address, &format!("{}{{", post(address, "/api/undo", 9_000)));
     daemon.signal(Signal::TERM);
-    let told = Instant::now();
+    let begin = Instant::now();
     assert_eq!(daemon.ended().0.code(), Some(0));
-    let took = told.elapsed();
+    let took = begin.elapsed();
     println!("ended {took:?} after the signal");
     assert!(took < Duration::from_secs(20), "{took:?}");
     drop((crowd, pages));
@@ -242,11 +242,11 @@ fn peers_have_ten_seconds_each_time() {
         until_ended(stream);
     }
     in_time(begin);
-    let said = String::from_utf8(until_ended(&mut body)).unwrap();
-    assert!(said.starts_with("HTTP/1.1 408 "), "{said}");
+    let reply = String::from_utf8(until_ended(&mut body)).unwrap();
+    assert!(reply.starts_with("HTTP/1.1 408 "), "{reply}");
     in_time(begin);
-    let said = until_ended(&mut kept);
-    assert!(said.starts_with(b"HTTP/1.1 200 ") && said.len() > length);
+    let reply = until_ended(&mut kept);
+    assert!(reply.starts_with(b"HTTP/1.1 200 ") && reply.len() > length);
     in_time(begin);
     // The same time again, so that requests in flight surely finish and no others arrive.
     until_ended(&mut TcpStream::connect(address).unwrap());

@@ -14,10 +14,10 @@ fn term_drains_and_exits_0() {
     daemon.client().hello().unwrap();
     daemon.signal(Signal::TERM);
     daemon.await_notice("STOPPING=1");
-    let (status, said) = daemon.ended();
-    assert_eq!(status.code(), Some(0), "{said:?}");
+    let (status, printed) = daemon.ended();
+    assert_eq!(status.code(), Some(0), "{printed:?}");
     assert!(!exists(home.path("s")), "the socket file is gone");
-    assert!(said.iter().any(|l| l.contains("drained")), "{said:?}");
+    assert!(printed.iter().any(|l| l.contains("drained")), "{printed:?}");
 }
 
 #[test]
@@ -32,8 +32,8 @@ fn what_term_leaves_is_taken_up_at_the_next_start() {
     let (body, frames) = add_request("c", &shapes, wire::AddMode::Job);
     daemon.client().call(body, frames).unwrap();
     daemon.signal(Signal::TERM);
-    let (status, said) = daemon.ended();
-    assert_eq!(status.code(), Some(0), "{said:?}");
+    let (status, printed) = daemon.ended();
+    assert_eq!(status.code(), Some(0), "{printed:?}");
     let daemon = home.start();
     let client = &mut daemon.client();
     wait_idle(client, "c");
@@ -116,12 +116,13 @@ fn the_watchdog_is_fed() {
 fn a_second_daemon_is_refused_and_a_dead_ones_socket_replaced() {
     let home = Home::new();
     let daemon = home.start();
-    let (status, said) = home.spawn(&[], &[]).ended();
+    let (status, printed) = home.spawn(&[], &[]).ended();
     assert_eq!(status.code(), Some(1));
     assert!(
-        said.iter()
+        printed
+            .iter()
             .any(|l| l.contains("/s is in use by a running daemon, process ")),
-        "{said:?}"
+        "{printed:?}"
     );
     daemon.client().hello().unwrap();
     daemon.signal(Signal::KILL);
@@ -146,11 +147,11 @@ fn endpoints_that_others_could_reach_are_refused() {
         ("inproc://x", "is neither ipc://PATH nor tcp://HOST:PORT"),
         (&long, "its socket path has 125 bytes, the limit is 100"),
     ] {
-        let (status, said) = home.spawn(&["--endpoint", endpoint], &[]).ended();
-        assert_eq!(status.code(), Some(2), "{endpoint}: {said:?}");
+        let (status, printed) = home.spawn(&["--endpoint", endpoint], &[]).ended();
+        assert_eq!(status.code(), Some(2), "{endpoint}: {printed:?}");
         assert!(
-            said.iter().any(|l| l.contains(message)),
-            "{endpoint}: {said:?}"
+            printed.iter().any(|l| l.contains(message)),
+            "{endpoint}: {printed:?}"
         );
     }
 }
@@ -184,8 +185,8 @@ fn a_client_can_drain_over_ipc() {
     let home = Home::new();
     let daemon = home.start();
     call!(daemon.client(), Drain(wire::DrainRequest {})).unwrap();
-    let (status, said) = daemon.ended();
-    assert_eq!(status.code(), Some(0), "{said:?}");
+    let (status, printed) = daemon.ended();
+    assert_eq!(status.code(), Some(0), "{printed:?}");
 }
 
 #[test]

@@ -110,8 +110,8 @@ fn a_file_that_hangs_stalls_the_request_that_names_it_and_no_other() {
         return;
     };
     let mut line = String::new();
-    let mut said = std::io::BufReader::new(holder.stdout.take().unwrap());
-    std::io::BufRead::read_line(&mut said, &mut line).unwrap();
+    let mut printed = std::io::BufReader::new(holder.stdout.take().unwrap());
+    std::io::BufRead::read_line(&mut printed, &mut line).unwrap();
     if line.trim() != "leased" {
         println!("skipped: files cannot be leased here");
         holder.wait().unwrap();

@@ -23,10 +23,10 @@ fn frames_and_values_beyond_those_that_are_known_are_refused() {
         (Body::Stats(wire::StatsRequest {}), 3),
         (Body::AddShapes(request.clone()), 2),
     ] {
-        let (code, reason, said) = stray(body, n_frames);
+        let (code, reason, message) = stray(body, n_frames);
         let expected = (ErrorCode::InvalidArgument, ErrorReason::FrameMissing);
-        assert_eq!((code, reason), expected, "{said}");
-        assert!(said.contains("no field names frame"), "{said}");
+        assert_eq!((code, reason), expected, "{message}");
+        assert!(message.contains("no field names frame"), "{message}");
     }
     let with_mode = wire::AddShapesRequest {
         mode: 99,

@@ -142,8 +142,8 @@ fn a_revoked_key_is_refused_at_once_on_both_sockets() {
     // A client without a key receives nothing.
     let plain = zmq::Context::new().socket(zmq::SUB).unwrap();
     plain.set_subscribe(b"").unwrap();
-    let said = boss.hello().unwrap().event_endpoint.clone();
-    let port = said.rsplit(':').next().unwrap();
+    let events = boss.hello().unwrap().event_endpoint.clone();
+    let port = events.rsplit(':').next().unwrap();
     plain.connect(&format!("tcp://127.0.0.1:{port}")).unwrap();
 
     let keys_dir = home.path("keys").display().to_string();
@@ -330,8 +330,8 @@ fn crowds_and_monsters_at_the_door_do_not_keep_a_good_client_out() {
     let context = zmq::Context::new();
     let keys = keys(&home, "feeder");
     let mut reader = Client::connect_with(&endpoint, SERVED, Some(keys.clone())).unwrap();
-    let said = reader.hello().unwrap().event_endpoint.clone();
-    let port = said.rsplit(':').next().unwrap();
+    let events = reader.hello().unwrap().event_endpoint.clone();
+    let port = events.rsplit(':').next().unwrap();
     let subscriber = context.socket(zmq::SUB).unwrap();
     keys.apply(&subscriber).unwrap();
     subscriber.set_linger(0).unwrap();

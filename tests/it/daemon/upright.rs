@@ -32,13 +32,13 @@ fn the_command_line_warns_of_a_wrong_axis_and_changes_it() {
     let run = |args: &[&str]| home.coseg(args);
     let warned = |output: &std::process::Output| -> bool {
         let text = String::from_utf8_lossy(&output.stderr).into_owned();
-        let said = text.contains("of its shapes stand along +y");
+        let warns = text.contains("of its shapes stand along +y");
         assert_eq!(
-            said,
+            warns,
             text.contains("coseg collections set fallen --up +y"),
             "{text}"
         );
-        said
+        warns
     };
     let added = run(&[
         "add",

@@ -111,22 +111,22 @@ fn a_planted_wrong_map_is_found_and_recomputed() {
 
     let notes = Library::check(folder.path()).unwrap();
     assert!(notes.iter().all(|f| !f.damage), "{notes:?}");
-    let place = format!("maps {}, {}", row.from, row.to);
-    assert!(notes.iter().any(|f| f.place == place), "{notes:?}");
+    let location = format!("maps {}, {}", row.from, row.to);
+    assert!(notes.iter().any(|f| f.location == location), "{notes:?}");
     let library = Library::open(folder.path()).unwrap();
     let standing = |from: &str, to: &str| {
         let map = library.map(COLLECTION, from, to).unwrap();
         library.standing(COLLECTION, from, to, &map).unwrap()
     };
-    let told = standing(names.0, names.1).unwrap();
-    assert!(told.inconsistent && told.departure > 0.5, "{told:?}");
+    let found = standing(names.0, names.1).unwrap();
+    assert!(found.inconsistent && found.departure > 0.5, "{found:?}");
     drop(library);
     let repaired = Library::repair(folder.path()).unwrap();
-    let told = format!("{} to {}: made anew", names.0, names.1);
-    let done = repaired.done.iter().find(|d| d.contains(&told));
+    let line = format!("{} to {}: made anew", names.0, names.1);
+    let done = repaired.done.iter().find(|d| d.contains(&line));
     println!("{}", done.unwrap_or_else(|| panic!("{:?}", repaired.done)));
     assert!(
-        repaired.left.iter().all(|f| f.place != place),
+        repaired.left.iter().all(|f| f.location != location),
         "{:?}",
         repaired.left
     );

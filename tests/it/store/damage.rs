@@ -23,7 +23,7 @@ fn damage(library: &Path) -> Vec<String> {
     findings
         .into_iter()
         .filter(|f| f.damage)
-        .map(|f| format!("{}: {}", f.place, f.message))
+        .map(|f| format!("{}: {}", f.location, f.message))
         .collect()
 }
 

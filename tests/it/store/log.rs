@@ -83,7 +83,7 @@ fn damage(library: &Path) -> Vec<String> {
     let findings = check(library).expect("runs");
     let damage = findings.into_iter().filter(|f| f.damage);
     damage
-        .map(|f| format!("{}: {}", f.place, f.message))
+        .map(|f| format!("{}: {}", f.location, f.message))
         .collect()
 }
 

@@ -12,8 +12,8 @@ use coseg::labels::{Features, LabelModel, Normalisation, Statistics};
 use coseg::mesh::Format;
 use coseg::neighbors::SignatureMetric;
 use coseg::pipeline::{
-    Description, DescriptionView, Params, Prepared, TeachOptions, Vote, carried, describe,
-    label_taught, map, map_by_descriptors, proxy_pins, unlikeness,
+    Description, DescriptionView, FitOptions, Params, Prepared, Vote, describe,
+    descriptor_distance, label_fitted, map, map_by_descriptors, proxy_pins, vote_probabilities,
 };
 use coseg::segmentation::Surface;
 use rand::SeedableRng as _;
@@ -64,7 +64,7 @@ struct Pair {
     by_descriptors: (Vec<u32>, Confidence),
     /// Area share on which the transferred labels are right.
     accuracy: f64,
-    unlike: f64,
+    distance: f64,
 }
 
 /// Figures of a category.
@@ -217,10 +217,10 @@ fn bench(category: &Category) -> Result<Row, BenchError> {
                 by_descriptors: map_by_descriptors((&a, pa), (&b, pb)),
                 map: found,
                 accuracy: 0.0,
-                unlike: unlikeness(pa, pb),
+                distance: descriptor_distance(pa, pb),
             };
             let vote = as_vote(&a, &votes[i], &pair, true);
-            let (faces, _) = carried(&b, &[vote], prep.k);
+            let (faces, _) = vote_probabilities(&b, &[vote], prep.k);
             pair.accuracy = prep.shapes[j].accuracy(&most_likely(&faces, prep.k));
             Some(pair)
         })
@@ -302,11 +302,11 @@ fn target<'a>(
     };
     let signature = |s: usize| prep.shapes[s].description.signature.as_slice();
     let distance = |i: usize| metric.distance(signature(t), signature(i));
-    let unlike = |i: usize| pair(i).map_or(f64::INFINITY, |p| p.unlike);
+    let compared = |i: usize| pair(i).map_or(f64::INFINITY, |p| p.distance);
     let as_placed = |among: &[usize]| {
         let mut near = by(&distance, among);
         near.truncate(2 * N_BEST);
-        by(&unlike, &near)
+        by(&compared, &near)
     };
     let label = |sources: &[usize], labelled: &[usize], arm: usize| -> f64 {
         let views: Vec<DescriptionView<'_>> = sources
@@ -328,17 +328,17 @@ fn target<'a>(
                 statistics.accumulate(&Statistics::of_shape(features, area, class, prep.k), 1.0);
             }
         }
-        let options = TeachOptions {
+        let options = FitOptions {
             vote_share: if arm < 2 {
                 1.0
             } else {
-                TeachOptions::default().vote_share
+                FitOptions::default().vote_share
             },
-            ..TeachOptions::default()
+            ..FitOptions::default()
         };
         let view = prep.shapes[t].description.view();
         let given = if arm == 2 { &[][..] } else { &given[..] };
-        let found = label_taught(
+        let found = label_fitted(
             &view,
             &prep.prepared[t],
             (&statistics, None),

@@ -19,7 +19,7 @@
 //! Before the cut a face's evidence is mixed with the mean over the part of the shape that it is in: a limb is of one label
 //! more often than evidence face by face says.
 
-use super::place::{blended, carried};
+use super::place::{blended, vote_probabilities};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
 use crate::labels::cut::{STRENGTH, cut};
@@ -33,24 +33,24 @@ const N_PARTS_MORE: usize = 4;
 
 /// Weights of teaching.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TeachOptions {
+pub struct FitOptions {
     /// Rounds in which the representatives learn from each other, after the one in which they learn from the
     /// exemplars alone.
     pub n_rounds: usize,
     /// Share of the vote through maps in the log-linear mean with the discriminant.
     pub vote_share: f64,
     /// Weight of an exemplar's vote against that of a shape that was labelled by carrying.
-    pub exemplar_trust: f64,
+    pub training_trust: f64,
     /// Weight in the discriminant of a face that a person labelled, against one whose label was discovered.
     pub pinned_weight: f64,
     /// Weight of all shapes labelled by carrying together against all exemplars together, in the discriminant.
-    pub carried_weight: f64,
+    pub propagated_weight: f64,
     /// Least probability of a face that the discriminant is trained on, if no person labelled it.
     pub confident: f64,
     /// Exemplars that tell as much as the labels that were discovered, of where the labels' means are and of how
-    /// descriptors scatter around them: with n exemplars, what was discovered has `discovered_exemplars /
-    /// (discovered_exemplars + n)` of the say.
-    pub discovered_exemplars: f64,
+    /// descriptors scatter around them: with n exemplars, what was discovered has `discovered_worth /
+    /// (discovered_worth + n)` of the say.
+    pub discovered_worth: f64,
     /// Temperature of the discriminant, which is trained on few shapes and too certain.
     pub temperature: f64,
     /// Share, in what each class of a face costs, of the mean over the part that the face is in.
@@ -59,16 +59,16 @@ pub struct TeachOptions {
     pub strength: f64,
 }
 
-impl Default for TeachOptions {
+impl Default for FitOptions {
     fn default() -> Self {
         Self {
             n_rounds: 1,
             vote_share: 0.5,
-            exemplar_trust: 2.0,
+            training_trust: 2.0,
             pinned_weight: 4.0,
-            carried_weight: 1.0,
+            propagated_weight: 1.0,
             confident: 0.7,
-            discovered_exemplars: 2.0,
+            discovered_worth: 2.0,
             temperature: 2.0,
             part_share: 0.3,
             strength: STRENGTH,
@@ -78,7 +78,7 @@ impl Default for TeachOptions {
 
 /// A representative shape that learns, and teaches the others.
 #[derive(Debug, Clone, Copy)]
-pub struct Lesson<'a> {
+pub struct FitShape<'a> {
     /// Its arrays.
     pub shape: DescriptionView<'a>,
     /// What is derived from them under the collection's normalisation.
@@ -89,10 +89,10 @@ pub struct Lesson<'a> {
     pub discovered: &'a [u8],
 }
 
-/// A map between two lessons.
+/// A map between two members.
 #[derive(Debug, Clone, Copy)]
-pub struct LessonMap<'a> {
-    /// Labels are carried from this lesson
+pub struct FitMap<'a> {
+    /// Labels are carried from this member
     pub from: usize,
     /// to this one.
     pub to: usize,
@@ -104,56 +104,56 @@ pub struct LessonMap<'a> {
 
 /// What the representatives have learnt.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Taught {
+pub struct Fitted {
     /// What makes the discriminant.
     pub statistics: Statistics,
     /// What the labels that were discovered before mean now.
     pub prior: Option<PriorLabels>,
-    /// Labelling of each lesson.
+    /// Labelling of each member.
     pub labellings: Vec<Labelling>,
 }
 
-/// What counts besides the lessons.
+/// What counts besides the members.
 #[derive(Debug, Clone, Copy)]
-pub struct Given<'a> {
+pub struct FurtherEvidence<'a> {
     /// Statistics of faces that were labelled: pinned ones of further exemplars, and discovered ones that still count.
     pub statistics: &'a Statistics,
-    /// Training shapes, those among the lessons included: each counts by the share of its area that is pinned.
-    pub n_exemplars: f64,
+    /// Training shapes, those among the members included: each counts by the share of its area that is pinned.
+    pub n_training: f64,
     /// Statistics of the labels that were discovered before anything was labelled, over many shapes, where they count
     /// no more themselves: what parts are like on average, and how like parts of different shapes differ, of which a few
     /// exemplars say little.
     pub discovered: Option<&'a Statistics>,
 }
 
-/// Teaches the lessons `k` classes. Costs a cut for each lesson and round.
-pub fn teach(
-    lessons: &[Lesson<'_>],
-    maps: &[LessonMap<'_>],
-    given: &Given<'_>,
+/// Teaches the members `k` classes. Costs a cut for each member and round.
+pub fn fit(
+    members: &[FitShape<'_>],
+    maps: &[FitMap<'_>],
+    further: &FurtherEvidence<'_>,
     k: usize,
-    options: &TeachOptions,
-) -> Taught {
-    let worth = options.discovered_exemplars;
-    let share = worth / (worth + given.n_exemplars);
-    let scatter = given.discovered.map(Statistics::scatter_within);
+    options: &FitOptions,
+) -> Fitted {
+    let worth = options.discovered_worth;
+    let share = worth / (worth + further.n_training);
+    let scatter = further.discovered.map(Statistics::scatter_within);
     let with_scatter = |statistics: &Statistics| match &scatter {
         Some(scatter) => statistics.with_scatter(scatter, share),
         None => statistics.clone(),
     };
-    let mut certain = given.statistics.clone();
-    for lesson in lessons.iter().filter(|l| !l.pinned.is_empty()) {
-        let class = |f: usize| lesson.pinned[f];
+    let mut certain = further.statistics.clone();
+    for member in members.iter().filter(|l| !l.pinned.is_empty()) {
+        let class = |f: usize| member.pinned[f];
         let of_shape = Statistics::of_shape(
-            &lesson.prepared.features,
-            &lesson.prepared.surface.area,
+            &member.prepared.features,
+            &member.prepared.surface.area,
             class,
             k,
         );
         certain.accumulate(&of_shape, options.pinned_weight);
     }
-    let prior = given.discovered.map(|discovered| {
-        let pinned = lessons.iter().filter(|l| !l.pinned.is_empty());
+    let prior = further.discovered.map(|discovered| {
+        let pinned = members.iter().filter(|l| !l.pinned.is_empty());
         let pinned = pinned.map(|l| Pinned {
             surface: &l.prepared.surface,
             features: &l.prepared.features,
@@ -163,39 +163,39 @@ pub fn teach(
     });
     if let Some(prior) = &prior {
         let translated = prior.translated();
-        let each = certain.total() / given.n_exemplars.max(1e-3);
+        let each = certain.total() / further.n_training.max(1e-3);
         let weight = worth * each / translated.total().max(1e-12);
         certain.accumulate(&translated, weight);
     }
-    let own: Vec<Option<OwnVote>> = lessons
+    let own: Vec<Option<OwnVote>> = members
         .par_iter()
         .map(|l| Some(OwnVote::new(&l.shape, l.prepared, prior.as_ref()?)))
         .collect();
-    let part_of: Vec<Vec<u32>> = lessons
+    let part_of: Vec<Vec<u32>> = members
         .par_iter()
         .map(|l| parts_for(&l.shape, l.prepared, k))
         .collect();
-    let mut votes: Vec<Vec<u8>> = lessons.iter().map(|l| first_vote(l, k)).collect();
+    let mut votes: Vec<Vec<u8>> = members.iter().map(|l| first_vote(l, k)).collect();
     let mut statistics = with_scatter(&certain);
     let mut labellings = Vec::new();
     for round in 0..=options.n_rounds {
         let classifier = statistics.classifier().at_temperature(options.temperature);
-        labellings = (0..lessons.len())
+        labellings = (0..members.len())
             .into_par_iter()
             .map(|to| {
-                let lesson = &lessons[to];
+                let member = &members[to];
                 let into: Vec<Vote<'_>> = maps
                     .iter()
                     .filter(|m| m.to == to && !votes[m.from].is_empty())
                     .map(|m| Vote {
-                        faces: lessons[m.from].shape.faces,
+                        faces: members[m.from].shape.faces,
                         probabilities: &votes[m.from],
                         p2p: m.p2p,
                         confidence: m.confidence,
-                        trust: if lessons[m.from].pinned.is_empty() {
+                        trust: if members[m.from].pinned.is_empty() {
                             1.0
                         } else {
-                            options.exemplar_trust
+                            options.training_trust
                         },
                     })
                     .collect();
@@ -204,18 +204,18 @@ pub fn teach(
                     votes: &into,
                     own: own[to].as_ref(),
                     part_of: &part_of[to],
-                    pinned: lesson.pinned,
+                    pinned: member.pinned,
                 };
-                labelled(&lesson.shape, lesson.prepared, &evidence, k, options)
+                labelled(&member.shape, member.prepared, &evidence, k, options)
             })
             .collect();
         if round < options.n_rounds {
             votes = labellings.iter().map(|l| l.probabilities.clone()).collect();
-            let more = with_confident(&certain, lessons, &labellings, k, options);
+            let more = with_confident(&certain, members, &labellings, k, options);
             statistics = with_scatter(&more);
         }
     }
-    Taught {
+    Fitted {
         statistics,
         prior,
         labellings,
@@ -224,13 +224,13 @@ pub fn teach(
 
 /// Labels a shape from what was taught: votes through maps from exemplars and representatives, and of the labels that were
 /// discovered before; the discriminant that `statistics` make; and the faces a person labelled, which keep their class.
-pub fn label_taught(
+pub fn label_fitted(
     shape: &DescriptionView<'_>,
     prepared: &Prepared,
     (statistics, prior): (&Statistics, Option<&PriorLabels>),
     votes: &[Vote<'_>],
     pinned: &[Option<u32>],
-    options: &TeachOptions,
+    options: &FitOptions,
 ) -> Labelling {
     let k = statistics.counts.len();
     let own = prior.map(|prior| OwnVote::new(shape, prepared, prior));
@@ -267,14 +267,14 @@ pub fn proxy_pins(
     area.chunks_exact(k + 1).map(most).collect()
 }
 
-/// What a lesson says before it has learnt anything: what a person pinned, else what was discovered.
-fn first_vote(lesson: &Lesson<'_>, k: usize) -> Vec<u8> {
-    let mut vote = match (lesson.discovered, lesson.pinned) {
+/// What a member says before it has learnt anything: what a person pinned, else what was discovered.
+fn first_vote(member: &FitShape<'_>, k: usize) -> Vec<u8> {
+    let mut vote = match (member.discovered, member.pinned) {
         ([], []) => return Vec::new(),
         ([], pinned) => vec![0; pinned.len() * k],
         (discovered, _) => discovered.to_vec(),
     };
-    for (row, pin) in vote.chunks_exact_mut(k).zip(lesson.pinned) {
+    for (row, pin) in vote.chunks_exact_mut(k).zip(member.pinned) {
         if let Some(class) = pin {
             row.fill(0);
             row[*class as usize] = u8::MAX;
@@ -286,32 +286,32 @@ fn first_vote(lesson: &Lesson<'_>, k: usize) -> Vec<u8> {
 /// The certain statistics with the confident faces of what was carried, all of them together of a given weight.
 fn with_confident(
     certain: &Statistics,
-    lessons: &[Lesson<'_>],
+    members: &[FitShape<'_>],
     labellings: &[Labelling],
     k: usize,
-    options: &TeachOptions,
+    options: &FitOptions,
 ) -> Statistics {
     let dim = certain.sums.len() / k.max(1);
-    let mut carried = Statistics::empty(k, dim);
+    let mut confident = Statistics::empty(k, dim);
     let least = (options.confident * 255.0) as u8;
-    for (lesson, labelling) in lessons.iter().zip(labellings) {
+    for (member, labelling) in members.iter().zip(labellings) {
         let class = |f: usize| {
             let class = labelling.classes[f];
-            let is_pinned = lesson.pinned.get(f).is_some_and(Option::is_some);
+            let is_pinned = member.pinned.get(f).is_some_and(Option::is_some);
             let confident = labelling.probabilities[f * k + class as usize] >= least;
             (confident && !is_pinned).then_some(class)
         };
         let of_shape = Statistics::of_shape(
-            &lesson.prepared.features,
-            &lesson.prepared.surface.area,
+            &member.prepared.features,
+            &member.prepared.surface.area,
             class,
             k,
         );
-        carried.accumulate(&of_shape, 1.0);
+        confident.accumulate(&of_shape, 1.0);
     }
-    let weight = options.carried_weight * certain.total() / carried.total().max(1e-12);
+    let weight = options.propagated_weight * certain.total() / confident.total().max(1e-12);
     let mut all = certain.clone();
-    all.accumulate(&carried, weight.min(1.0));
+    all.accumulate(&confident, weight.min(1.0));
     all
 }
 
@@ -324,10 +324,13 @@ struct OwnVote {
 
 impl OwnVote {
     fn new(shape: &DescriptionView<'_>, prepared: &Prepared, prior: &PriorLabels) -> Self {
-        let said = prior.probabilities(&prepared.surface, &prepared.features);
+        let discovered = prior.probabilities(&prepared.surface, &prepared.features);
         let n = shape.vertices.len();
         Self {
-            probabilities: said.iter().map(|p| (p * 255.0).round() as u8).collect(),
+            probabilities: discovered
+                .iter()
+                .map(|p| (p * 255.0).round() as u8)
+                .collect(),
             p2p: (0..n as u32).collect(),
             confidence: Confidence::everywhere(prior.agreement, n),
         }
@@ -357,7 +360,7 @@ fn labelled(
     prepared: &Prepared,
     evidence: &Evidence<'_>,
     k: usize,
-    options: &TeachOptions,
+    options: &FitOptions,
 ) -> Labelling {
     let log_model = evidence.classifier.log_probabilities(&prepared.features);
     let mut votes = evidence.votes.to_vec();
@@ -368,12 +371,12 @@ fn labelled(
         confidence: &own.confidence,
         trust: 1.0,
     }));
-    let (carried, mut weights) = carried(shape, &votes, k);
+    let (voted, mut weights) = vote_probabilities(shape, &votes, k);
     // Those of the other shapes among themselves.
     weights.truncate(evidence.votes.len());
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum.max(1e-300));
-    let unary = blended(&log_model, &carried, options.vote_share, k);
+    let unary = blended(&log_model, &voted, options.vote_share, k);
     let part_of = evidence.part_of;
     let unary = shared_by_parts(unary, &prepared.surface, part_of, k, options.part_share);
     let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);

@@ -88,11 +88,11 @@ impl Divided {
         for (v, p) in self.parts.iter().enumerate() {
             mine[(v, *p as usize)] = self.mass[v];
         }
-        let carried = &other.basis * (self.map_to(other) * self.basis.tr_mul(&mine));
+        let mapped = &other.basis * (self.map_to(other) * self.basis.tr_mul(&mine));
         let mut cost = vec![0.0; k * k];
         for (v, p) in other.parts.iter().enumerate() {
             for l in 0..k {
-                cost[*p as usize * k + l] -= other.mass[v] * carried[(v, l)];
+                cost[*p as usize * k + l] -= other.mass[v] * mapped[(v, l)];
             }
         }
         let matched = assignment(&cost, k, k).into_iter();
@@ -105,7 +105,7 @@ impl Divided {
 ///
 /// # Errors
 /// A shape has no mesh Laplacian, or its spectrum cannot be proved complete.
-pub fn literal(
+pub fn yang_tian_baseline(
     shapes: &[DescriptionView<'_>],
     k: usize,
     seed: u64,
