@@ -1,6 +1,7 @@
-//! What others would answer on the same descriptors: the yardsticks of `coseg-bench labels`.
+//! Baselines for `coseg-bench labels`: other methods on the same descriptors.
 //!
-//! All of them group the patches of all shapes at once, with k clusters, and stop there.
+//! Each of them groups the patches of all shapes at once into k clusters. It has no classifier, no
+//! cut and no choice among candidates.
 
 use super::discover::{DiscoveryInput, Prepared};
 use super::joint::{Rows, diffusion, embedding, inter_shape, row_normalised, symmetric};
@@ -8,28 +9,28 @@ use crate::linalg::kmeans::kmeans;
 use nalgebra::{Cholesky, DMatrix};
 use std::collections::BTreeMap;
 
-/// Starts of each k-means.
+/// Number of starts of each k-means.
 const N_STARTS: usize = 5;
 /// Ridge of the self-representation, relative to the mean squared norm of a patch.
 const RIDGE: f64 = 0.1;
-/// Strongest links of a patch that are kept.
+/// Number of strongest links that are retained for each patch.
 const N_LINKS: usize = 20;
 
-/// A way to label shapes together that is not ours.
+/// A method of other authors that labels shapes together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
-    /// k-means of patch descriptors.
+    /// k-means on patch descriptors.
     PatchKMeans,
-    /// Clustering in the diffusion space of the patches, as Sidi et al. 2011, *Unsupervised Co-Segmentation of a
-    /// Set of Shapes via Descriptor-Space Spectral Clustering*.
+    /// Clustering in the diffusion space of the patches: Sidi et al. 2011, *Unsupervised
+    /// Co-Segmentation of a Set of Shapes via Descriptor-Space Spectral Clustering*.
     Diffusion,
-    /// Patches represented by each other, as Hu, Fan and Liu 2012, *Co-Segmentation of 3D Shapes via Subspace
-    /// Clustering*; by least squares (Lu et al. 2012), which has a closed form.
+    /// Represents each patch by the others: Hu, Fan and Liu 2012, *Co-Segmentation of 3D Shapes via
+    /// Subspace Clustering*. Uses least squares (Lu et al. 2012), which has a closed form.
     Subspace,
 }
 
 impl Baseline {
-    /// All of them, with names for a table.
+    /// All baselines with their names in a table.
     pub const ALL: [(Self, &'static str); 3] = [
         (Self::PatchKMeans, "patch k-means"),
         (Self::Diffusion, "diffusion space (DSSC-style)"),
@@ -37,7 +38,7 @@ impl Baseline {
     ];
 }
 
-/// Label below `k` of each face of each shape. Deterministic for a given seed.
+/// Returns a label below `k` for each face of each shape. Deterministic for a given seed.
 pub fn baseline(which: Baseline, input: &DiscoveryInput<'_>, k: usize, seed: u64) -> Vec<Vec<u32>> {
     if input.shapes.is_empty() {
         return Vec::new();
@@ -69,7 +70,8 @@ pub fn baseline(which: Baseline, input: &DiscoveryInput<'_>, k: usize, seed: u64
     shapes.on_faces(&of_patch)
 }
 
-/// Affinity `|Z| + |Z|ᵀ` of the Z that minimises `‖X − X Z‖² + λ‖Z‖²`, only the strongest links of each patch.
+/// Computes the affinity `|Z| + |Z|ᵀ` of the Z that minimises `‖X − X Z‖² + λ‖Z‖²`, restricted to
+/// the strongest links of each patch.
 fn self_representation(shapes: &Prepared<'_>) -> sprs::CsMat<f64> {
     let n = shapes.area.len();
     let x = DMatrix::from_column_slice(shapes.dim, n, &shapes.means);

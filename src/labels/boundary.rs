@@ -1,27 +1,28 @@
-//! Labels of the proxy become labels of the input mesh, with boundaries that follow its own creases.
+//! Labels of the proxy become labels of the input mesh, with boundaries along creases of that mesh.
 //!
-//! Away from boundaries a face takes the label of its proxy face. In a band around them, about as wide as the
-//! proxy's triangles, a cut at full resolution decides.
+//! Away from boundaries, a face takes the label of its proxy face. In a band around the boundaries,
+//! about as wide as the proxy's triangles, a cut at full resolution decides.
 
 use super::cut::{STRENGTH, cut};
 use crate::segmentation::{Surface, SurfaceEdge};
 
 /// Half width of the band, in mean edge lengths of the proxy.
 const BAND_EDGES: f64 = 1.5;
-/// Least probability that counts.
+/// Probabilities below this count as this.
 const FLOOR: f64 = 0.02;
-/// All this holds where an edge of the proxy is at most this many of the surface, plus one. On finer ones
-/// evidence, which grows with area, would outweigh boundaries, which grow with length, until labels follow the
-/// proxy's triangles; so the strength grows along, up to a limit beyond which cuts would take long.
+/// Up to this ratio of the mean edge lengths of proxy and surface, plus one, the boundary strength
+/// stays as it was tuned. On finer surfaces evidence, which grows with area, would outweigh
+/// boundaries, which grow with length, and labels would follow the proxy's triangles. The strength
+/// therefore grows with the ratio, up to a limit beyond which cuts would take too long.
 const TUNED_RATIO: f64 = 3.0;
 const MAX_GAIN: f64 = 2.0;
-/// There the proxy does not say where within a triangle a boundary runs: evidence is full only this far from it,
-/// in mean edge lengths of the proxy.
+/// On such surfaces the proxy does not show where a boundary runs within a triangle. Evidence has
+/// its full weight only at this distance from the boundary, in mean edge lengths of the proxy.
 const UNSURE_EDGES: f64 = 0.75;
 
-/// Classes of the faces `(m,)` of a full-resolution surface, given for each its proxy face, and the proxy's
-/// classes `(p,)` and probabilities `(p, k)`, 0 to 255. `proxy_edge` is the proxy's mean edge length, in the
-/// same units as the surface.
+/// Returns the class of each face `(m,)` of a full-resolution surface. `proxy_face` has the proxy
+/// face of each face; `classes (p,)` and `probabilities (p, k)`, 0 to 255, are those of the proxy;
+/// `proxy_edge` is the proxy's mean edge length in the units of the surface.
 pub fn refine_boundary(
     surface: &Surface,
     proxy_face: &[u32],
@@ -33,7 +34,7 @@ pub fn refine_boundary(
     let m = surface.n_faces();
     let mut labels: Vec<u32> = proxy_face.iter().map(|p| classes[*p as usize]).collect();
     let depth = band(surface, &labels, BAND_EDGES * proxy_edge);
-    // The band, and the faces around it as pinned border conditions.
+    // The faces of the band, and the faces around them, which are pinned as border conditions.
     let mut local = vec![u32::MAX; m];
     let mut members: Vec<u32> = Vec::new();
     let mut include = |f: u32, members: &mut Vec<u32>| {
@@ -91,7 +92,8 @@ pub fn refine_boundary(
     labels
 }
 
-/// Distance of each face from the nearest label boundary along the dual graph; infinite beyond `width`.
+/// Returns the distance of each face from the nearest label boundary along the dual graph; infinite
+/// beyond `width`.
 fn band(surface: &Surface, labels: &[u32], width: f64) -> Vec<f64> {
     let m = surface.n_faces();
     let mut neighbours: Vec<Vec<(u32, f64)>> = vec![Vec::new(); m];
@@ -112,7 +114,7 @@ fn band(surface: &Surface, labels: &[u32], width: f64) -> Vec<f64> {
             }
         }
     }
-    // Label correcting: the band is a few rings wide, so a queue does without a heap.
+    // Label-correcting search: the band is a few rings wide, so a queue needs no priorities.
     while !front.is_empty() {
         let mut next = Vec::new();
         for f in front {
@@ -133,7 +135,7 @@ fn band(surface: &Surface, labels: &[u32], width: f64) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// A strip of `n` faces with a concave crease between faces `crease` and `crease + 1`.
+    /// Builds a strip of `n` faces with a concave crease between faces `crease` and `crease + 1`.
     fn strip(n: u32, crease: u32) -> Surface {
         let edge = |a: u32| SurfaceEdge {
             faces: [a, a + 1],
@@ -167,7 +169,8 @@ mod tests {
         );
     }
 
-    /// A sheet of `n` by `n` squares, whose proxy has saw teeth of `tooth` squares between two labels.
+    /// Builds a sheet of `n` by `n` squares whose proxy has a boundary of saw teeth, `tooth`
+    /// squares wide, between two labels.
     fn saw(n: u32, tooth: u32) -> (Surface, Vec<u32>) {
         let mut edges = Vec::new();
         let mut join = |a: u32, b: u32| {

@@ -1,4 +1,4 @@
-//! Many ways to group the parts of a few shapes: the pool from which a labelling is chosen.
+//! The parts of a few shapes become many candidate labellings, among which discovery chooses.
 
 use super::criterion::{CREASE_SCALE, Criterion};
 use super::discover::{Prepared, PreparedShape};
@@ -9,27 +9,28 @@ use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 
-/// Starts of each k-means.
+/// Number of starts of each k-means.
 const N_STARTS: usize = 3;
-/// Labellings kept by the beam search while merging, and at its end.
+/// Number of labellings that the beam search retains while merging, and returns.
 const BEAM_WIDTH: usize = 6;
 const BEAM_KEPT: usize = 3;
-/// Weights, relative to the mean descriptors of a part, of their spread and of the neighbours' means.
+/// Weight of the spread of a part's descriptors, relative to their means; then the weight of the
+/// neighbours' means.
 const SPREAD_WEIGHT: f64 = 0.5;
 const CONTEXT_WEIGHT: f64 = 0.2;
 const SHAPE_WEIGHT: f64 = 1.3;
-/// Part vectors are clipped to this many standard deviations.
+/// Part vectors are clipped to this number of standard deviations.
 const CLIP: f64 = 3.0;
 
-/// Three views of what makes parts alike: weights of the descriptor groups
-/// sdf, agd, gc, q, pc, pos, hks, hksn, wks, up.
+/// Three weightings of the descriptor groups for the similarity of parts. The groups are sdf, agd,
+/// gc, q, pc, pos, hks, hksn, wks, up.
 const WEIGHTINGS: [[f64; 10]; 3] = [
     [1.0, 0.7, 0.5, 0.3, 1.6, 1.4, 1.0, 1.0, 1.5, 1.5],
     [0.7, 0.5, 0.3, 0.2, 0.7, 0.5, 1.0, 1.5, 2.0, 1.0],
     [1.0, 0.3, 0.2, 0.2, 2.0, 0.5, 0.5, 0.5, 1.5, 1.5],
 ];
 
-/// Labellings of all patches with exactly `k` labels, without duplicates up to renaming.
+/// Returns labellings of all patches with exactly `k` labels, without duplicates up to renaming.
 pub(super) fn pool(
     shapes: &Prepared<'_>,
     criterion: &Criterion,
@@ -88,7 +89,8 @@ struct Grouping {
     of_patch: Vec<u32>,
 }
 
-/// What a labelling with `n_labels >= k` labels becomes when it is merged down to k by beam search.
+/// Merges the labels of a labelling with `n_labels >= k` labels until `k` are left, by beam search,
+/// and returns the best results.
 fn merged_to(k: usize, criterion: &Criterion, labels: Vec<u32>, n_labels: usize) -> Vec<Vec<u32>> {
     let mut beam = vec![(criterion.pair_sums(&labels, n_labels), labels)];
     for size in (k + 1..=n_labels).rev() {
@@ -125,7 +127,7 @@ struct Pool {
 }
 
 impl Pool {
-    /// Takes a labelling unless a label is empty or the same partition is there already.
+    /// Adds a labelling, unless it has an empty label or the pool contains the same partition.
     fn add(&mut self, mut labels: Vec<u32>) {
         let mut names = vec![u32::MAX; labels.iter().max().map_or(0, |m| *m as usize + 1)];
         let mut next = 0;
@@ -146,13 +148,13 @@ impl Pool {
 /// The parts of all shapes at one granularity.
 struct Parts {
     graphs: Vec<PartGraph>,
-    /// Where the parts of each shape begin.
+    /// Index of the first part of each shape.
     offsets: Vec<usize>,
-    /// Part, numbered through, of each patch, numbered through.
+    /// For each patch of all shapes, in order, the index of its part.
     part_of_patch: Vec<u32>,
-    /// Roots of the area shares.
+    /// Square roots of the area shares.
     weights: Vec<f64>,
-    /// Affinity of touching parts.
+    /// Affinity of parts that touch.
     touching: sprs::CsMat<f64>,
 }
 
@@ -202,8 +204,8 @@ impl Parts {
         self.weights.len()
     }
 
-    /// Groups the parts by their vectors and by the joint graph at each share of the intra-shape graph, into each
-    /// number of labels.
+    /// Groups the parts into each number of labels: by their vectors, and by the joint graph with
+    /// each share of the intra-shape graph.
     fn groupings(
         &self,
         vectors: &[f64],
@@ -249,8 +251,9 @@ impl Parts {
             .collect()
     }
 
-    /// Part vectors `(n_parts, 3 dim + 11)`: standardised over all parts, then weighted by group; in a learnt
-    /// metric, where columns are comparable, scaled as a whole instead.
+    /// Returns part vectors `(n_parts, 3 dim + 11)`. They are standardised over all parts and
+    /// weighted by descriptor group. In a learned metric, where columns are comparable, they are
+    /// scaled as a whole instead.
     fn vectors(&self, shapes: &Prepared<'_>, weighting: &[f64; 10]) -> Vec<f64> {
         let mut column_weights = Vec::with_capacity(shapes.dim);
         for ((_, width), g) in super::features::groups(shapes.up_known)
@@ -325,7 +328,7 @@ impl Column {
         }
     }
 
-    /// Over `deviation` and clipped there, times `weight`.
+    /// Divides by `deviation`, clips at `clip` and multiplies by `weight`.
     fn scaled(&self, deviation: f64, clip: f64, weight: f64) -> impl Iterator<Item = f64> {
         let scale = move |x: &f64| weight * (x / deviation).clamp(-clip, clip);
         self.centred.iter().map(scale)

@@ -1,10 +1,11 @@
-//! How good a labelling of patches is, without any ground truth.
+//! Scores a labelling of patches without ground truth.
 //!
-//! Good labels have boundaries along concave creases and join what is alike or touches, more than chance would:
-//! `½ ln(concavity) + ln(modularity)`. Concavity is the length-weighted mean crease on label boundaries over that
-//! on all patch boundaries; modularity the share of affinity within labels above its expectation (Newman and
-//! Girvan 2004), in the joint patch graph. Modularity rather than the plain share within labels, because the
-//! latter rewards one label that swallows most of every shape, and cannot compare different numbers of labels.
+//! A good labelling has its boundaries along concave creases, and gives one label to patches that
+//! are similar or touch, more than chance would. The score is `½ ln(concavity) + ln(modularity)`.
+//! Concavity is the length-weighted mean crease on label boundaries, relative to that on all patch
+//! boundaries. Modularity is the share of affinity within labels above its expectation in the joint
+//! patch graph (Newman and Girvan 2004). The plain share within labels would reward one label that
+//! covers most of every shape, and could not compare different numbers of labels.
 
 use super::joint::{Rows, combine, inter_shape, symmetric};
 use crate::segmentation::PatchGraph;
@@ -14,17 +15,17 @@ use sprs::CsMat;
 const CONCAVITY_WEIGHT: f64 = 0.5;
 /// Share of the intra-shape graph in the joint patch graph.
 const ALPHA: f64 = 0.5;
-/// Crease at which the affinity of touching patches has fallen to 1/e.
+/// Crease at which the affinity of two touching patches has fallen to 1/e.
 pub(super) const CREASE_SCALE: f64 = 0.1;
 
-/// The patches of all shapes, numbered through, with their boundaries and affinities.
+/// The patches of all shapes in one numbering, with their boundaries and affinities.
 pub(super) struct Criterion {
     boundaries: Vec<(u32, u32, f64, f64)>,
     mean_crease: f64,
     affinity: CsMat<f64>,
 }
 
-/// Sums over pairs of labels `(k, k)`: boundary length, creased length, affinity.
+/// Sums over pairs of labels `(k, k)`: length of boundaries, length weighted by crease, affinity.
 #[derive(Clone)]
 pub(super) struct PairSums {
     k: usize,
@@ -34,7 +35,8 @@ pub(super) struct PairSums {
 }
 
 impl Criterion {
-    /// The criterion on the patches of some shapes, whose mean descriptors are `means (n_patches, dim)`.
+    /// Builds the criterion for the patches of some shapes with the mean descriptors `means
+    /// (n_patches, dim)`.
     pub(super) fn new(
         patches: &[&PatchGraph],
         means: &[f64],
@@ -72,7 +74,7 @@ impl Criterion {
         }
     }
 
-    /// Pair sums of a labelling of all patches with labels below `k`.
+    /// Computes the pair sums of a labelling of all patches with labels below `k`.
     pub(super) fn pair_sums(&self, labels: &[u32], k: usize) -> PairSums {
         let mut sums = PairSums {
             k,
@@ -95,15 +97,16 @@ impl Criterion {
         sums
     }
 
-    /// Log of the concavity of the boundaries between labels: their length-weighted mean crease relative to that of
-    /// all patch boundaries.
+    /// Returns the log of the concavity of the label boundaries: their length-weighted mean crease,
+    /// relative to that of all patch boundaries.
     pub(super) fn log_concavity(&self, sums: &PairSums) -> f64 {
         let boundary = sums.between(&sums.creased) / sums.between(&sums.length).max(1e-9);
         let concavity = boundary / self.mean_crease.max(1e-300);
         concavity.max(1e-3).ln()
     }
 
-    /// The score of a labelling, from its pair sums; higher is better, also between numbers of labels.
+    /// Computes the score of a labelling from its pair sums. Higher is better, also between
+    /// different numbers of labels.
     pub(super) fn score(&self, sums: &PairSums) -> f64 {
         let k = sums.k;
         let total: f64 = sums.affinity.iter().sum::<f64>().max(1e-300);
@@ -118,12 +121,12 @@ impl Criterion {
 }
 
 impl PairSums {
-    /// What lies between different labels.
+    /// Sums the entries between different labels.
     fn between(&self, m: &[f64]) -> f64 {
         m.iter().sum::<f64>() - (0..self.k).map(|l| m[l * self.k + l]).sum::<f64>()
     }
 
-    /// The sums after label `b` is merged into `a`, and labels above `b` move down by one.
+    /// Returns the sums after label `b` was merged into `a` and labels above `b` moved down by one.
     pub(super) fn merged(&self, a: usize, b: usize) -> Self {
         let k = self.k - 1;
         let place = |l: usize| match l.cmp(&b) {

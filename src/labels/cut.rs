@@ -4,15 +4,15 @@
 use crate::linalg::maxflow::Network;
 use crate::segmentation::Surface;
 
-/// Boundary strength with which shapes are labelled. While labels are discovered it is higher.
+/// Boundary strength for labelling shapes. Discovery uses a higher one.
 pub const STRENGTH: f64 = 3.0;
-/// Energies are rounded to this many units a nat, so that cuts are exact in integers.
+/// Energies are rounded to multiples of 1 / `UNITS` nat, so that cuts are exact in integers.
 const UNITS: f64 = 1e6;
-/// Evidence against a label counts at most this many nats.
+/// Upper limit of the evidence against a label, in nats.
 const CAP_NATS: f64 = 50.0;
 const MAX_SWEEPS: usize = 4;
 
-/// The integer energy: `unary (m, k)` and one cost for each edge whose ends differ.
+/// The integer energy: `unary (m, k)`, and a cost for each edge whose ends have different labels.
 struct Energy<'a> {
     unary: Vec<i64>,
     k: usize,
@@ -36,10 +36,10 @@ impl Energy<'_> {
         faces + edges
     }
 
-    /// The best labelling in which some faces change to `alpha` and the others keep theirs.
+    /// Returns the best labelling in which each face either changes to `alpha` or keeps its label.
     fn expand(&self, labels: &[u32], alpha: u32) -> Vec<u32> {
         let mut network = Network::new(labels.len());
-        // Sink side: takes alpha.
+        // The cost of taking alpha, which is the sink side of the cut.
         let mut take: Vec<i64> = (0..labels.len())
             .map(|f| self.unary[f * self.k + alpha as usize])
             .collect();
@@ -60,8 +60,9 @@ impl Energy<'_> {
             let both_keep = if labels[p] != labels[q] { w } else { 0 };
             let q_takes = if labels[p] != alpha { w } else { 0 };
             let p_takes = if labels[q] != alpha { w } else { 0 };
-            // With x = 1 for taking alpha: both_keep + (p_takes − both_keep) x_p − p_takes x_q
-            // + (q_takes + p_takes − both_keep) (1 − x_p) x_q; the negative term counts for keeping instead.
+            // With x = 1 for taking alpha: both_keep + (p_takes − both_keep) x_p − p_takes x_q +
+            // (q_takes + p_takes − both_keep) (1 − x_p) x_q. The negative term is added to the cost
+            // of keeping.
             keep[p] += both_keep;
             take[p] += p_takes;
             keep[q] += p_takes;
@@ -79,9 +80,9 @@ impl Energy<'_> {
     }
 }
 
-/// Labels `(m,)` that locally minimise
-/// `Σ_f m a_f unary_f,l(f) + strength Σ_e boundary_cost_e [l(e₀) ≠ l(e₁)]`, where `unary (m, k)` is in nats
-/// (usually −ln p), `a` are area shares and `boundary_cost` is 1 for a flat edge of mean length.
+/// Returns labels `(m,)` that locally minimise `Σ_f m a_f unary_f,l(f) + strength Σ_e
+/// boundary_cost_e [l(e₀) ≠ l(e₁)]`. `unary (m, k)` is in nats (usually −ln p), `a` are area
+/// shares, and `boundary_cost` is 1 for a flat edge of mean length.
 ///
 /// No single α-expansion lowers the energy of the result. Faces with a label in `pinned` keep it.
 pub fn cut(

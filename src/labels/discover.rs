@@ -1,9 +1,10 @@
 //! Shapes without labels become shapes with consistent labels: parts that recur, found together.
 //!
-//! Every shape's patches are merged into parts; the parts of all shapes are grouped in many ways (descriptor
-//! clustering, spectral clustering of a joint graph after Sidi et al. 2011, *Unsupervised Co-Segmentation of a
-//! Set of Shapes via Descriptor-Space Spectral Clustering*); the labelling is chosen by an unsupervised score
-//! plus its consensus with the other good ones, then refined face by face.
+//! The patches of each shape are merged into parts. The parts of all shapes are grouped in many
+//! ways: by clustering of descriptors, and by spectral clustering of a joint graph after Sidi et
+//! al. 2011, *Unsupervised Co-Segmentation of a Set of Shapes via Descriptor-Space Spectral
+//! Clustering*. An unsupervised score, together with the consensus among good candidates, chooses
+//! the labelling, which is then refined face by face.
 
 use super::candidates::pool;
 use super::criterion::Criterion;
@@ -14,18 +15,18 @@ use super::{Features, Statistics};
 use crate::segmentation::{PatchGraph, Surface};
 use rayon::prelude::*;
 
-/// Labellings from which a metric is learnt.
+/// Number of best labellings from which a metric is learned.
 const N_METRIC_SOURCES: usize = 10;
-/// Candidates that are refined face by face before the choice is made.
+/// Number of candidates that are refined face by face before the choice is made.
 const SHORTLIST: usize = 4;
-/// Rounds of classifier and cut, and the area share of change below which they stop.
+/// Rounds of classifier and cut; then the area share of changed faces below which they stop.
 const REFINEMENTS: usize = 2;
 const SETTLED: f64 = 0.003;
-/// Boundary strength and cap of the evidence (nats) in a refinement.
+/// Boundary strength of a refinement; then the upper limit of its evidence, in nats.
 const STRENGTH: f64 = 5.0;
 const CAP_NATS: f64 = 7.0;
 
-/// One shape as discovery sees it.
+/// One shape as input of discovery.
 #[derive(Debug, Clone, Copy)]
 pub struct ShapeInput<'a> {
     /// Its dual graph.
@@ -36,21 +37,21 @@ pub struct ShapeInput<'a> {
     pub features: &'a Features,
 }
 
-/// The shapes to be labelled together; features standardised alike.
+/// The shapes to be labelled together, with features standardised over all of them.
 #[derive(Debug, Clone)]
 pub struct DiscoveryInput<'a> {
     /// The shapes.
     pub shapes: Vec<ShapeInput<'a>>,
-    /// Whether the features end with the columns of a known up axis.
+    /// Whether the features end with the columns of the up axis.
     pub up_known: bool,
 }
 
-/// How many labels, and the seed.
+/// The number of labels and the seed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DiscoveryOptions {
     /// Number of labels; `None`: estimated between 2 and `max_labels`.
     pub n_labels: Option<usize>,
-    /// Most labels an estimate may give.
+    /// Upper limit of an estimated number of labels.
     pub max_labels: usize,
     /// Seed of every random start.
     pub seed: u64,
@@ -73,13 +74,15 @@ pub struct Discovery {
     pub labels: Vec<Vec<u32>>,
     /// Number of labels.
     pub n_labels: usize,
-    /// Its value: log concavity of its boundaries, by the number of shapes, plus consensus with the candidates.
+    /// Value of the labelling: the log concavity of its boundaries, weighted by the number of
+    /// shapes, plus its consensus with the candidates.
     pub value: f64,
-    /// The value of the labelling that is there, judged by the same candidates; negative infinity without one.
+    /// Value of the current labelling, judged by the same candidates; negative infinity without
+    /// one.
     pub current_value: f64,
 }
 
-/// A shape with its mean descriptors by patch.
+/// A shape with the mean descriptors of its patches.
 pub(super) struct PreparedShape<'a> {
     pub(super) surface: &'a Surface,
     pub(super) patches: &'a PatchGraph,
@@ -87,15 +90,15 @@ pub(super) struct PreparedShape<'a> {
     pub(super) patch_means: &'a [f64],
 }
 
-/// The input with what every step needs of it.
+/// The input with the values that every step needs.
 pub(super) struct Prepared<'a> {
     pub(super) input: &'a DiscoveryInput<'a>,
     pub(super) dim: usize,
     pub(super) up_known: bool,
-    /// Whether the features are in a learnt metric, in which columns are comparable.
+    /// Whether the features are in a learned metric, in which columns are comparable.
     pub(super) learned_metric: bool,
     pub(super) means: Vec<f64>,
-    /// Where the patches of each shape begin.
+    /// Index of the first patch of each shape.
     pub(super) offsets: Vec<usize>,
     /// Area share of each patch, summing to the number of shapes.
     pub(super) area: Vec<f64>,
@@ -143,7 +146,7 @@ impl<'a> Prepared<'a> {
         Criterion::new(&patches, &self.means, self.dim, &self.offsets)
     }
 
-    /// A labelling of all patches, face by face.
+    /// Converts a labelling of all patches to labels of faces.
     pub(super) fn on_faces(&self, of_patch: &[u32]) -> Vec<Vec<u32>> {
         let shapes = self.input.shapes.iter().zip(&self.offsets);
         shapes
@@ -157,7 +160,7 @@ impl<'a> Prepared<'a> {
             .collect()
     }
 
-    /// Label of most of each patch's area, over all shapes.
+    /// Returns, for each patch of all shapes, the label of most of its area.
     fn majority(&self, labels: &[Vec<u32>], k: usize) -> Vec<u32> {
         let mut out = Vec::with_capacity(self.area.len());
         for (s, labels) in self.input.shapes.iter().zip(labels) {
@@ -174,10 +177,12 @@ impl<'a> Prepared<'a> {
     }
 }
 
-/// Labels the faces of all shapes consistently. Deterministic for given options. The cost grows with the
-/// square of the number of parts (about 25 a shape): meant for up to a few dozen shapes.
+/// Labels the faces of all shapes consistently. Deterministic for given options. The cost grows
+/// with the square of the number of parts (about 25 in a shape): meant for up to a few dozen
+/// shapes.
 ///
-/// `current` is the labelling that is there, if any, with its number of labels; it is judged beside the new one.
+/// `current` is the current labelling, if any, with its number of labels. It is judged by the same
+/// candidates as the new one.
 pub fn discover(
     input: &DiscoveryInput<'_>,
     options: &DiscoveryOptions,
@@ -208,7 +213,7 @@ pub fn discover(
         .unwrap_or_else(|| estimate(&shapes, &criterion, options));
     let chosen = choose(&shapes, &criterion, k, options.seed, current);
     chosen.unwrap_or_else(|| {
-        // Fewer patches than labels: each patch its own.
+        // With fewer patches than labels, each patch gets a label of its own.
         let labels = input
             .shapes
             .iter()
@@ -229,7 +234,7 @@ pub fn discover(
     })
 }
 
-/// The number of labels whose best candidate is best.
+/// Returns the number of labels whose best candidate has the highest value.
 fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOptions) -> usize {
     let value = |k: usize| {
         let candidates = pool(shapes, criterion, k, options.seed);
@@ -244,9 +249,9 @@ fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOpt
     best.map_or(2, |(k, _)| k)
 }
 
-/// The best labelling with `k` labels. Candidates are refined patch by patch; from the best of them a metric is
-/// learnt, in which parts are grouped once more; the best of all are refined face by face, and judged again as
-/// what they became. `None` if there is no candidate.
+/// Returns the best labelling with `k` labels. Candidates are refined patch by patch. A metric is
+/// learned from the best of them, and parts are grouped once more in that metric. The best of all
+/// are refined face by face and judged again. Returns `None` if there is no candidate.
 fn choose(
     shapes: &Prepared<'_>,
     criterion: &Criterion,
@@ -310,7 +315,7 @@ fn choose(
     })
 }
 
-/// Alternates a linear classifier of all faces and a cut of each shape.
+/// Alternates between fitting a linear classifier of all faces and a cut of each shape.
 fn refine(input: &DiscoveryInput<'_>, mut labels: Vec<Vec<u32>>, k: usize) -> Vec<Vec<u32>> {
     for _ in 0..REFINEMENTS {
         let dim = input.shapes[0].features.dim;
@@ -320,7 +325,8 @@ fn refine(input: &DiscoveryInput<'_>, mut labels: Vec<Vec<u32>>, k: usize) -> Ve
                 Statistics::of_shape(s.features, &s.surface.area, |f| Some(labels[f]), k)
             })
             .collect();
-        // In the order of the shapes, so that sums are the same on any number of threads.
+        // Added in the order of the shapes, so that the sums do not depend on the number of
+        // threads.
         for of_shape in &of_shapes {
             statistics.accumulate(of_shape, 1.0);
         }

@@ -1,21 +1,23 @@
-//! Face descriptors become comparable across a collection: standardised, clipped, weighted by group.
+//! Makes face descriptors comparable across a collection: standardised, clipped and weighted by
+//! group.
 
 use crate::description::DescriptionView;
 use crate::descriptors;
 
-/// Standardised values are clipped to this many standard deviations.
+/// Standardised values are clipped to this number of standard deviations.
 const CLIP: f64 = 4.0;
 
-/// Face descriptors of one shape, row-major `(m, dim)`; with a known up axis [`descriptors::N_UP_COLUMNS`] more.
+/// Face descriptors of one shape, row-major `(m, dim)`. With a known up axis they have
+/// [`descriptors::N_UP_COLUMNS`] more columns.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Features {
     /// The values.
     pub data: Vec<f32>,
-    /// Columns.
+    /// Number of columns.
     pub dim: usize,
 }
 
-/// Names and widths of the descriptor groups, in column order.
+/// Returns names and widths of the descriptor groups, in the order of the columns.
 pub(crate) fn groups(up_known: bool) -> Vec<(&'static str, usize)> {
     let mut groups = descriptors::GROUPS.to_vec();
     if up_known {
@@ -25,7 +27,8 @@ pub(crate) fn groups(up_known: bool) -> Vec<(&'static str, usize)> {
 }
 
 impl Features {
-    /// The descriptors of a shape as they are; `up` is the collection's up axis, if it is known.
+    /// Returns the descriptors of a shape without standardisation; `up` is the collection's up
+    /// axis, if known.
     pub fn raw(shape: &DescriptionView<'_>, up: Option<[f64; 3]>) -> Self {
         let n = shape.n_descriptors;
         let Some(axis) = up else {
@@ -44,7 +47,7 @@ impl Features {
         Self { data, dim }
     }
 
-    /// Values at vertices `(n, dim)`: area-weighted means over the faces around each.
+    /// Returns values at vertices `(n, dim)`: area-weighted means over the adjacent faces.
     pub fn at_vertices(&self, n_vertices: usize, faces: &[[u32; 3]], area: &[f64]) -> Vec<f32> {
         let mut sum = vec![0.0f64; n_vertices * self.dim];
         let mut weight = vec![0.0f64; n_vertices];
@@ -65,19 +68,20 @@ impl Features {
     }
 }
 
-/// What standardises the descriptors of a collection.
+/// Mean and deviation that standardise the descriptors of a collection.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normalisation {
     /// Area-weighted mean of each column.
     pub mean: Vec<f64>,
     /// Area-weighted standard deviation of each column.
     pub deviation: Vec<f64>,
-    /// Whether the columns of the up axis are among them.
+    /// Whether the columns include those of the up axis.
     pub up_known: bool,
 }
 
 impl Normalisation {
-    /// Mean and deviation over shapes of equal weight; each comes as raw features and area shares.
+    /// Computes mean and deviation over shapes of equal weight. Each shape has raw features and the
+    /// area shares of its faces.
     pub fn fit<'a>(
         shapes: impl Iterator<Item = (&'a Features, &'a [f64])>,
         up_known: bool,
@@ -108,8 +112,8 @@ impl Normalisation {
         }
     }
 
-    /// `clip((x − mean) / deviation, ±4) / √(width of the column's group)`. What was fitted when the up axis had
-    /// fewer columns takes the first of them.
+    /// Returns `clip((x − mean) / deviation, ±4) / √(width of the column's group)`. A normalisation
+    /// that was fitted when the up axis had fewer columns uses the first of them.
     pub fn standardise(&self, raw: &Features) -> Features {
         let dim = self.mean.len();
         assert!(

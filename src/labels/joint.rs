@@ -1,14 +1,15 @@
-//! Parts of many shapes become one affinity graph: similar parts of different shapes, and touching parts of
-//! one shape.
+//! Parts of many shapes become one affinity graph: it links similar parts of different shapes, and
+//! touching parts of one shape.
 
 use crate::linalg::lanczos_top::largest_eigenpairs;
 use nalgebra::DMatrix;
 use sprs::{CsMat, TriMat};
 
-/// Nearest rows linked in every other shape.
+/// Number of nearest rows in each other shape that a row is linked to.
 const N_NEAREST: usize = 2;
 
-/// Rows of several shapes, one after the other: `values (n, dim)` and where each shape begins.
+/// Rows of several shapes, one shape after the other: `values (n, dim)`, and the index of the first
+/// row of each shape.
 pub(super) struct Rows<'a> {
     pub(super) values: &'a [f64],
     pub(super) dim: usize,
@@ -16,9 +17,10 @@ pub(super) struct Rows<'a> {
     pub(super) offsets: &'a [usize],
 }
 
-/// Symmetric affinity between rows of different shapes: each row is linked to its two nearest in every
-/// other shape with `exp(−D² / √(sᵢ sⱼ))`, `sᵢ` the median D² of i's links (self-tuning: Zelnik-Manor and
-/// Perona 2004); of the two directions of a link the stronger counts.
+/// Computes the symmetric affinity between rows of different shapes. Each row is linked to its two
+/// nearest in every other shape with `exp(−D² / √(sᵢ sⱼ))`, where `sᵢ` is the median D² of i's
+/// links (self-tuning: Zelnik-Manor and Perona 2004). Of the two directions of a link the stronger
+/// counts.
 pub(super) fn inter_shape(rows: &Rows<'_>) -> CsMat<f64> {
     let n = *rows.offsets.last().unwrap_or(&0);
     let mut links: Vec<(usize, usize, f64)> = Vec::new();
@@ -71,7 +73,7 @@ pub(super) fn inter_shape(rows: &Rows<'_>) -> CsMat<f64> {
     symmetric(n, strongest.into_iter().map(|((i, j), w)| (i, j, w)))
 }
 
-/// A symmetric matrix from its upper entries.
+/// Builds a symmetric matrix from its upper entries.
 pub(super) fn symmetric(n: usize, upper: impl Iterator<Item = (usize, usize, f64)>) -> CsMat<f64> {
     let mut t = TriMat::new((n, n));
     for (i, j, w) in upper {
@@ -83,7 +85,7 @@ pub(super) fn symmetric(n: usize, upper: impl Iterator<Item = (usize, usize, f64
     t.to_csr()
 }
 
-/// Row sums.
+/// Returns the row sums.
 pub(super) fn degrees(matrix: &CsMat<f64>) -> Vec<f64> {
     matrix
         .outer_iterator()
@@ -91,7 +93,7 @@ pub(super) fn degrees(matrix: &CsMat<f64>) -> Vec<f64> {
         .collect()
 }
 
-/// `D^{-1/2} M D^{-1/2}`.
+/// Returns `D^{-1/2} M D^{-1/2}`.
 fn normalised(matrix: &CsMat<f64>) -> CsMat<f64> {
     let roots: Vec<f64> = degrees(matrix)
         .iter()
@@ -106,20 +108,21 @@ fn normalised(matrix: &CsMat<f64>) -> CsMat<f64> {
     out
 }
 
-/// `(1 − α) N(inter) + α N(intra)`, N the symmetric normalisation.
+/// Returns `(1 − α) N(inter) + α N(intra)`, where N is the symmetric normalisation.
 pub(super) fn combine(inter: &CsMat<f64>, intra: &CsMat<f64>, alpha: f64) -> CsMat<f64> {
     let a = normalised(inter).map(|w| (1.0 - alpha) * w);
     let b = normalised(intra).map(|w| alpha * w);
     &a + &b
 }
 
-/// Eigenvalues (descending) and eigenvectors `(n, k)` of the normalised graph, and its degrees.
+/// Returns eigenvalues (descending) and eigenvectors `(n, k)` of the normalised graph, and its
+/// degrees.
 pub(super) fn embedding(graph: &CsMat<f64>, k: usize) -> (Vec<f64>, DMatrix<f64>, Vec<f64>) {
     let (values, vectors) = largest_eigenpairs(&normalised(graph), k);
     (values, vectors, degrees(graph))
 }
 
-/// The first `width` eigenvectors, rows scaled to length 1 (Ng, Jordan and Weiss 2001).
+/// Returns the first `width` eigenvectors with rows scaled to length 1 (Ng, Jordan and Weiss 2001).
 pub(super) fn row_normalised(basis: &DMatrix<f64>, width: usize) -> Vec<f64> {
     let mut out = Vec::with_capacity(basis.nrows() * width);
     for row in basis.row_iter() {
@@ -129,7 +132,8 @@ pub(super) fn row_normalised(basis: &DMatrix<f64>, width: usize) -> Vec<f64> {
     out
 }
 
-/// Diffusion coordinates after three steps, without the constant one (Coifman and Lafon 2006).
+/// Returns diffusion coordinates after three steps, without the constant one (Coifman and Lafon
+/// 2006).
 pub(super) fn diffusion(
     values: &[f64],
     basis: &DMatrix<f64>,
@@ -151,7 +155,7 @@ mod tests {
 
     #[test]
     fn links_join_like_rows_of_different_shapes_only() {
-        // Two shapes of three parts each; part q of either lies near 10 q.
+        // Two shapes of three parts each; part q of both lies near 10 q.
         let values = [0.0, 10.0, 20.0, 0.5, 10.5, 20.5];
         let graph = inter_shape(&Rows {
             values: &values,

@@ -1,21 +1,23 @@
-//! Which of many candidate labellings is best, when nothing is known but the shapes.
+//! Chooses the best of many candidate labellings, without ground truth.
 //!
-//! The value of a labelling is the log of how concave its boundaries are plus how much it agrees with the other
-//! candidates, each counting by its own concavity. The two err in different ways: a few very concave boundaries may
-//! leave parts together that no other grouping joins, and what most groupings agree on may cut across limbs. On a
-//! few shapes a handful of deep creases decide on the concavity: it counts by the number of shapes, up to a full weight.
+//! The value of a labelling is the log of the concavity of its boundaries, plus its agreement with
+//! the other candidates, each weighted by its own concavity. The two terms err in different ways: a
+//! few very concave boundaries may leave parts together that no other grouping joins, and a
+//! boundary on which most groupings agree may cut across limbs. On a few shapes, a handful of deep
+//! creases decides the concavity; its weight therefore grows with the number of shapes, up to a
+//! limit.
 
 use super::criterion::Criterion;
 use nalgebra::DMatrix;
 
-/// Temperature of the log concavities when the candidates vote.
+/// Temperature of the softmax of the log concavities, which weights the candidates.
 const TEMPERATURE: f64 = 0.15;
-/// Shapes from which on the concavity has its full weight.
+/// Number of shapes from which on the concavity has its full weight.
 const FULL_WEIGHT_SHAPES: f64 = 14.0;
-/// Weight of the consensus beside the score, when numbers of labels are compared.
+/// Weight of the consensus relative to the score, where numbers of labels are compared.
 const CONSENSUS_WEIGHT: f64 = 0.5;
 
-/// Judges labellings by their concavity, and by how much they agree with what the good candidates agree on.
+/// Judges labellings by their concavity and by their agreement with good candidates.
 pub(super) struct Judge<'a> {
     criterion: &'a Criterion,
     /// Candidate labellings of all patches, and the softmax of their log concavities.
@@ -58,13 +60,13 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// The judge who has heard `more` candidates.
+    /// Adds candidates.
     pub(super) fn with_more(mut self, more: Vec<Vec<u32>>) -> Self {
         self.candidates.extend(more);
         Self::new(self.criterion, self.candidates, self.area, self.k)
     }
 
-    /// Value of each labelling of all patches, with labels below `k`.
+    /// Returns the value of each labelling of all patches with labels below `k`.
     pub(super) fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
         labellings
             .iter()
@@ -76,7 +78,7 @@ impl<'a> Judge<'a> {
             .collect()
     }
 
-    /// Positions of the `n` labellings of greatest value, best first.
+    /// Returns the positions of the `n` labellings of the greatest value, best first.
     pub(super) fn best(&self, labellings: &[Vec<u32>], n: usize) -> Vec<usize> {
         let values = self.values(labellings, self.k);
         let mut order: Vec<usize> = (0..values.len()).collect();
@@ -85,7 +87,8 @@ impl<'a> Judge<'a> {
         order
     }
 
-    /// The best candidate's score plus consensus, which numbers of labels can be compared by.
+    /// Returns the score of the best candidate plus its consensus; comparable between numbers of
+    /// labels.
     pub(super) fn comparable_value(&self) -> f64 {
         let consensus = self.consensus(&self.candidates, self.k);
         let candidates = self.candidates.iter().zip(consensus);
@@ -97,7 +100,8 @@ impl<'a> Judge<'a> {
             .fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// For each labelling the mean normalised mutual information with the candidates; areas weigh the patches.
+    /// Returns, for each labelling, the mean normalised mutual information with the candidates.
+    /// Patches are weighted by area.
     fn consensus(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
         let (mine, theirs) = (
             self.indicator(labellings, k),
@@ -128,7 +132,8 @@ impl<'a> Judge<'a> {
             .collect()
     }
 
-    /// Column `c k + l` holds the roots of the area shares of the patches that labelling c gives label l.
+    /// Returns a matrix whose column `c k + l` has the square roots of the area shares of the
+    /// patches with label l in labelling c.
     fn indicator(&self, labellings: &[Vec<u32>], k: usize) -> DMatrix<f64> {
         let total: f64 = self.area.iter().sum();
         let mut indicator = DMatrix::zeros(self.area.len(), labellings.len() * k);

@@ -1,8 +1,9 @@
-//! The labels of a collection: discovered, carried, and kept.
+//! The labels of a collection: discovered, and fitted to corrections.
 //!
-//! [`discover`] finds parts that recur over a few shapes while nothing is labelled. [`LabelModel`] is what a
-//! collection has learnt of its labels, [`PriorLabels`] what it had discovered before a person labelled anything.
-//! [`cut`] turns per-face evidence into a labelling with short boundaries along concave creases.
+//! [`discover`] finds parts that recur over a few shapes while nothing is labelled. [`LabelModel`]
+//! classifies faces by the labels of a collection. [`PriorLabels`] translates the labels that were
+//! discovered before a person labelled anything. [`cut`] turns per-face evidence into a labelling
+//! with short boundaries along concave creases.
 
 mod baselines;
 mod boundary;

@@ -1,13 +1,14 @@
-//! What a collection has learnt of its labels: linear discriminant analysis on face descriptors, kept as
-//! sufficient statistics, so that a shape is added or taken away exactly.
+//! The label model of a collection: linear discriminant analysis on face descriptors, stored as
+//! sufficient statistics, so that a shape can be added or removed exactly.
 
 use super::{Features, Normalisation};
 use nalgebra::{Cholesky, DMatrix};
 
-/// Share of the mean variance mixed into the pooled covariance.
+/// Share of the mean variance that is mixed into the pooled covariance.
 const SHRINKAGE: f64 = 0.02;
 
-/// Counts, sums and second moments of labelled faces, each weighted by its share of its shape's area.
+/// Counts, sums and second moments of labelled faces, each weighted by its share of its shape's
+/// area.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Statistics {
     /// Area of each label `(k,)`.
@@ -19,7 +20,7 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Statistics of nothing.
+    /// Statistics without any face.
     pub fn empty(k: usize, dim: usize) -> Self {
         Self {
             counts: vec![0.0; k],
@@ -28,7 +29,7 @@ impl Statistics {
         }
     }
 
-    /// Statistics of one labelled shape; faces whose label is `None` do not count.
+    /// Computes statistics of one labelled shape. Faces whose label is `None` do not count.
     pub fn of_shape(
         features: &Features,
         area: &[f64],
@@ -68,7 +69,8 @@ impl Statistics {
         }
     }
 
-    /// Scatter of the descriptors within labels `(dim, dim)`: pooled covariance around the labels' means.
+    /// Returns the scatter of the descriptors within labels `(dim, dim)`: the pooled covariance
+    /// around the labels' means.
     pub fn scatter_within(&self) -> DMatrix<f64> {
         let mean = self.means();
         let dim = mean.ncols();
@@ -78,7 +80,8 @@ impl Statistics {
         within / self.total().max(1e-300)
     }
 
-    /// The same counts and means, with `share` of the scatter within labels taken from elsewhere.
+    /// Returns the same counts and means, with `share` of the scatter within labels replaced by
+    /// `other`.
     pub fn with_scatter(&self, other: &DMatrix<f64>, share: f64) -> Self {
         let weight = share * self.total();
         let difference = (other - self.scatter_within()) * weight;
@@ -91,8 +94,8 @@ impl Statistics {
         mixed
     }
 
-    /// Statistics of other labels, of which each of these stands for some with the probabilities `meaning` `(k, n)`,
-    /// row-major, whose rows sum to one.
+    /// Translates the statistics to `n` other labels. Each label stands for them with the
+    /// probabilities `meaning (k, n)`, row-major, whose rows sum to one.
     pub(super) fn translated(&self, meaning: &[f64], n: usize) -> Self {
         let dim = self.sums.len() / self.counts.len().max(1);
         let mut out = Self {
@@ -112,12 +115,12 @@ impl Statistics {
         out
     }
 
-    /// Area of all labels.
+    /// Returns the area of all labels.
     pub fn total(&self) -> f64 {
         self.counts.iter().sum()
     }
 
-    /// Mean descriptors of each label `(k, dim)`.
+    /// Returns the mean descriptors of each label `(k, dim)`.
     fn means(&self) -> DMatrix<f64> {
         let k = self.counts.len();
         let dim = self.sums.len() / k.max(1);
@@ -126,7 +129,8 @@ impl Statistics {
         })
     }
 
-    /// The linear classifier these statistics make: pooled covariance with shrinkage, priors by area.
+    /// Builds the linear classifier of these statistics: pooled covariance with shrinkage, priors
+    /// by area.
     pub fn classifier(&self) -> Classifier {
         let mean = self.means();
         let (k, dim) = mean.shape();
@@ -137,7 +141,8 @@ impl Statistics {
         for c in 0..dim {
             within[(c, c)] += ridge.max(1e-9);
         }
-        // Shrinkage keeps it positive definite but for statistics of nothing, where weights are zero.
+        // Shrinkage makes the matrix positive definite, except for statistics without faces, whose
+        // weights are zero.
         let weights = Cholesky::new(within).map_or_else(
             || DMatrix::zeros(dim, k),
             |factor| factor.solve(&mean.transpose()),
@@ -168,14 +173,14 @@ pub struct Classifier {
 }
 
 impl Classifier {
-    /// The classifier at a temperature: scores are divided by it, so that above 1 it is less certain.
+    /// Divides the scores by `temperature`; above 1 the classifier becomes less certain.
     pub fn at_temperature(mut self, temperature: f64) -> Self {
         let scores = self.weights.iter_mut().chain(&mut self.bias);
         scores.for_each(|s| *s /= temperature);
         self
     }
 
-    /// Log-probability of each label for each face `(m, k)`, row-major.
+    /// Returns the log-probability of each label for each face `(m, k)`, row-major.
     pub fn log_probabilities(&self, features: &Features) -> Vec<f64> {
         let k = self.bias.len();
         let mut out = Vec::with_capacity(features.data.len() / self.dim * k);
@@ -203,13 +208,13 @@ impl Classifier {
 /// The label model of a collection.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelModel {
-    /// Counts the re-clusterings that were accepted; statistics of another epoch do not mix.
+    /// Number of accepted re-clusterings. Statistics of different epochs must not be added.
     pub epoch: u64,
     /// Label id of each class `(k,)`.
     pub labels: Vec<u32>,
-    /// What standardises descriptors in this epoch.
+    /// Standardises descriptors in this epoch.
     pub normalisation: Normalisation,
-    /// Sum over the shapes that inform the model.
+    /// Sum over the shapes on which the model is based.
     pub statistics: Statistics,
     /// Unit vector of the up axis in input coordinates, if it is known.
     pub up: Option<[f64; 3]>,

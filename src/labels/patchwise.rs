@@ -1,10 +1,11 @@
-//! Labellings of patches are refined, and learnt from, without touching a face.
+//! Refines labellings of patches, and learns a metric from them, without computing on faces.
 //!
-//! Alternating a linear classifier with a cut (as on faces, but on the eighty patches of a shape) costs a
-//! hundredth of what it does on faces, so that every candidate can be refined before one is chosen. The scatter
-//! within the labels of the best candidates tells which descriptors vary within a part; in the metric that
-//! weighs them down (linear discriminant analysis; Ding and Li 2007, *Adaptive dimension reduction using
-//! discriminant analysis and K-means clustering*, alternate the two) parts are grouped once more.
+//! Alternating between a linear classifier and a cut on the about 80 patches of a shape costs a
+//! hundredth of what it costs on its faces, so every candidate can be refined before one is chosen.
+//! The scatter within the labels of the best candidates shows which descriptors vary within a part.
+//! Parts are then grouped once more in the metric that weighs these descriptors down (linear
+//! discriminant analysis; Ding and Li 2007, *Adaptive dimension reduction using discriminant
+//! analysis and K-means clustering*, alternate the two).
 
 use super::Features;
 use super::cut::cut;
@@ -15,14 +16,16 @@ use std::collections::BTreeMap;
 
 /// Rounds of classifier and cut.
 const ROUNDS: usize = 3;
-/// Boundary strength and cap of the evidence (nats), as in the refinement of faces.
+/// Boundary strength; then the upper limit of the evidence, in nats; as in the refinement of faces.
 const STRENGTH: f64 = 5.0;
 const CAP_NATS: f64 = 7.0;
-/// Share of the mean variance mixed into the scatter within labels: for a classifier, and for a metric.
+/// Share of the mean variance that is mixed into the scatter within labels: for a classifier; then
+/// for a metric.
 const SHRINKAGE: f64 = 0.02;
 const METRIC_SHRINKAGE: f64 = 0.1;
 
-/// The patches of all shapes as one sample of descriptors, and each shape's as a small surface.
+/// The patches of all shapes as one sample of descriptors, and the patches of each shape as a small
+/// surface.
 pub(super) struct Patchwise<'a> {
     dim: usize,
     /// Descriptors `(dim, n_patches)` and area shares of the patches.
@@ -55,7 +58,8 @@ impl<'a> Patchwise<'a> {
         }
     }
 
-    /// Area `(k,)`, mean descriptors `(dim, k)` and scatter within labels `(dim, dim)` of a labelling.
+    /// Returns area `(k,)`, mean descriptors `(dim, k)` and scatter within labels `(dim, dim)` of a
+    /// labelling.
     fn scatter(&self, labels: &[u32], k: usize) -> (Vec<f64>, DMatrix<f64>, DMatrix<f64>) {
         let mut counts = vec![0.0; k];
         let mut sums = DMatrix::zeros(self.dim, k);
@@ -72,7 +76,8 @@ impl<'a> Patchwise<'a> {
         (counts, mean, within)
     }
 
-    /// The labelling after some rounds of linear classifier and cut; as it was, if a label would be lost.
+    /// Refines a labelling by some rounds of linear classifier and cut. Returns it unchanged if a
+    /// label would be lost.
     pub(super) fn refine(&self, given: &[u32], k: usize) -> Vec<u32> {
         let mut labels = given.to_vec();
         for _ in 0..ROUNDS {
@@ -110,8 +115,9 @@ impl<'a> Patchwise<'a> {
         if lost { given.to_vec() } else { labels }
     }
 
-    /// The metric in which the labels of some labellings are round on average: a `(dim, dim)` factor L of the
-    /// inverse scatter within labels, `W⁻¹ = L Lᵀ`, to be applied as `Lᵀ x`.
+    /// Returns the metric in which the labels of some labellings have isotropic scatter on average:
+    /// a `(dim, dim)` factor L of the inverse scatter within labels, `W⁻¹ = L Lᵀ`, to be applied as
+    /// `Lᵀ x`.
     pub(super) fn metric(&self, labellings: &[&Vec<u32>], k: usize) -> Option<DMatrix<f64>> {
         let mut within = DMatrix::zeros(self.dim, self.dim);
         for labels in labellings {
@@ -123,7 +129,7 @@ impl<'a> Patchwise<'a> {
     }
 }
 
-/// Descriptors in a metric.
+/// Returns descriptors in a metric.
 pub(super) fn in_metric(features: &Features, metric: &DMatrix<f64>) -> Features {
     let dim = features.dim;
     let rows = features.data.iter().map(|x| f64::from(*x));
@@ -135,7 +141,7 @@ pub(super) fn in_metric(features: &Features, metric: &DMatrix<f64>) -> Features 
     }
 }
 
-/// A scatter matrix with a share of its mean variance on the diagonal.
+/// Adds `share` of the mean variance of a scatter matrix to its diagonal.
 fn shrunk(mut scatter: DMatrix<f64>, share: f64) -> DMatrix<f64> {
     let dim = scatter.nrows();
     let ridge = share * scatter.trace() / dim.max(1) as f64;
@@ -146,8 +152,8 @@ fn shrunk(mut scatter: DMatrix<f64>, share: f64) -> DMatrix<f64> {
     scatter
 }
 
-/// The patches of a shape as if they were its faces; boundaries between them cost what they do on the faces,
-/// relative to the evidence.
+/// Returns the patches of a shape as the faces of a small surface. Boundaries between them cost as
+/// much as on the faces, relative to the evidence.
 fn coarse(surface: &Surface, patches: &PatchGraph) -> Surface {
     let mut costs = BTreeMap::<[u32; 2], (f64, f64)>::new();
     for e in &surface.edges {
@@ -191,7 +197,7 @@ mod tests {
         }
         let patchwise = Patchwise::new(&shapes);
         assert_eq!(patchwise.refine(&spoilt, 3), truth);
-        // A fourth label that one patch of one shape has cannot be kept and is not dropped either.
+        // A fourth label on one patch of one shape would be lost, so the labelling stays unchanged.
         let mut lone = truth.clone();
         lone[0] = 3;
         assert!(patchwise.refine(&lone, 4).contains(&3));

@@ -1,37 +1,40 @@
-//! Labels that were discovered before a person gave others: what they mean in the person's words, and how far they agree.
+//! Labels that were discovered before a person labelled faces: what they mean in the person's
+//! labels, and how well the two agree.
 
 use super::cut::{STRENGTH, cut};
 use super::{Features, Statistics};
 use crate::segmentation::Surface;
 
-/// Share of a shape's area that is added to what is seen of the meaning of a label, spread over all classes.
+/// Share of a shape's area that is added to the observed meaning of a label, spread over all
+/// classes.
 const UNSEEN_AREA: f64 = 0.05;
 
-/// A shape of which a person labelled faces.
+/// A shape with faces that a person labelled.
 #[derive(Debug, Clone, Copy)]
 pub struct Pinned<'a> {
     /// Its dual graph.
     pub surface: &'a Surface,
     /// Its standardised face descriptors.
     pub features: &'a Features,
-    /// Class of each face `(m,)`, none where the person translated nothing.
+    /// Class of each face `(m,)`; `None` where the person gave no label.
     pub classes: &'a [Option<u32>],
 }
 
-/// Discovered labels, as somebody sees them who has other words for the same parts.
+/// Discovered labels with their meaning in a person's classes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PriorLabels {
     /// Statistics of the `n` discovered labels, over the shapes that had them.
     pub statistics: Statistics,
-    /// For each of them a probability of each of the person's classes `(n, k)`, row-major.
+    /// Probability of each of the person's classes for each discovered label `(n, k)`, row-major.
     pub meaning: Vec<f64>,
-    /// How probable the person's classes are by that, on average over the area that the person labelled: 0 to 1.
+    /// Mean probability of the person's class under `meaning`, over the area that the person
+    /// labelled: 0 to 1.
     pub agreement: f64,
 }
 
 impl PriorLabels {
-    /// What the labels with these statistics mean to who labelled some shapes in `k` classes: the faces that both label
-    /// say so, by area. Costs a cut for each of the shapes.
+    /// Estimates the meaning of the labels with these statistics in `k` classes, from the faces of
+    /// some shapes that have both, by area. Costs a cut for each of the shapes.
     pub fn new<'a>(
         statistics: Statistics,
         pinned: impl Iterator<Item = Pinned<'a>>,
@@ -62,7 +65,8 @@ impl PriorLabels {
         }
     }
 
-    /// What the labels say of a shape, in the person's words: a probability of each class for each face `(m, k)`, row-major.
+    /// Returns the probability of each of the person's classes for each face `(m, k)`, row-major,
+    /// by the discovered labels alone.
     pub fn probabilities(&self, surface: &Surface, features: &Features) -> Vec<f64> {
         let k = self.n_classes();
         let labels = most_likely(&self.statistics, surface, features);
@@ -70,7 +74,7 @@ impl PriorLabels {
         labels.iter().flat_map(row).copied().collect()
     }
 
-    /// Statistics of the person's classes, if each label stands for some of them.
+    /// Translates the statistics of the discovered labels to the person's classes.
     pub fn translated(&self) -> Statistics {
         self.statistics.translated(&self.meaning, self.n_classes())
     }
@@ -80,7 +84,7 @@ impl PriorLabels {
     }
 }
 
-/// The label of each face by the classifier of the labels and a cut.
+/// Returns the discovered label of each face, by their classifier and a cut.
 fn most_likely(statistics: &Statistics, surface: &Surface, features: &Features) -> Vec<u32> {
     let log = statistics.classifier().log_probabilities(features);
     let unary: Vec<f64> = log.iter().map(|p| -p).collect();
@@ -92,8 +96,9 @@ mod tests {
     use super::super::test_shapes::Strips;
     use super::*;
 
-    /// Three discovered labels on strips of three parts, and a person who labelled the first strip in two classes: the
-    /// first two parts are 1, the third is 0, and half of its faces were not looked at.
+    /// Returns strips with three parts and a discovered label for each, and the classes of a person
+    /// on the first strip: 1 for the first two parts, 0 for the third, and none for half of the
+    /// faces.
     fn seen() -> (Strips, Vec<Option<u32>>, Statistics) {
         let strips = Strips::new(4, 3, 0.3);
         let input = strips.input();
@@ -130,7 +135,7 @@ mod tests {
         let right = translated.chunks(2).zip(&strips.truth);
         let right = right.filter(|(row, part)| row[usize::from(**part < 2)] > 0.5);
         assert_eq!(right.count(), strips.truth.len());
-        // Somebody whose classes have nothing to do with the labels is not agreed with.
+        // Classes that have nothing to do with the labels lead to low agreement.
         let at_random: Vec<Option<u32>> = (0..strips.truth.len())
             .map(|f| Some(f as u32 % 2))
             .collect();

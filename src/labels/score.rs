@@ -1,45 +1,46 @@
 //! Predicted and true labels of a collection become figures of how well they agree.
 //!
-//! Accuracy is over the collection, not over each shape: one assignment of predicted to true labels must
-//! serve all shapes, so that labels which mean different things on different shapes cost what they should.
-//! Rand error: X. Chen, A. Golovinskiy and T. Funkhouser, "A benchmark for 3D mesh segmentation", 2009.
+//! Accuracy is computed over the collection: one assignment of predicted to true labels must serve
+//! all shapes, so labels that mean different things on different shapes lower it. The Rand error is
+//! that of X. Chen, A. Golovinskiy and T. Funkhouser, "A benchmark for 3D mesh segmentation", 2009.
 
 use crate::linalg::assignment::assignment;
 use crate::mesh::TriMesh;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-/// A shape with its true labels and what was predicted.
+/// A shape with true and predicted labels.
 #[derive(Debug, Clone, Copy)]
 pub struct ScoredShape<'a> {
     /// Its mesh, m faces.
     pub mesh: &'a TriMesh,
     /// True labels, `(m,)`.
     pub truth: &'a [i32],
-    /// Predicted labels, `(m,)`; negative is 'no label' and is wrong. `None`: the whole shape is wrong.
+    /// Predicted labels, `(m,)`. A negative one is 'no label' and counts as wrong. `None`: the
+    /// whole shape is wrong.
     pub predicted: Option<&'a [i32]>,
 }
 
 /// How well predicted labels agree with true ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Score {
-    /// Shapes scored.
+    /// Number of scored shapes.
     pub n_shapes: usize,
-    /// Shapes without a prediction.
+    /// Number of shapes without a prediction.
     pub n_missing: usize,
     /// Mean over shapes of the area share with the right label after the assignment, 0 to 1.
     pub accuracy: f64,
-    /// The same when each predicted label may take its best true label, several the same one.
+    /// The same if each predicted label may take its best true label, several the same one.
     pub purity: f64,
-    /// One minus the Rand index of the connected pieces, by faces, averaged over predicted shapes;
-    /// `None` without predictions.
+    /// One minus the Rand index of the connected pieces, by faces, averaged over shapes with a
+    /// prediction; `None` without predictions.
     pub rand_error: Option<f64>,
-    /// Predicted labels in use.
+    /// Number of predicted labels in use.
     pub n_predicted_labels: usize,
-    /// True labels in use.
+    /// Number of true labels in use.
     pub n_true_labels: usize,
-    /// Pairs of predicted and true label, by predicted label. One-to-one.
+    /// Pairs of predicted and true label, sorted by predicted label; one to one.
     pub assignment: Vec<(i32, i32)>,
-    /// Accuracy of each shape, in the order given.
+    /// Accuracy of each shape, in the order of the input.
     pub shapes: Vec<f64>,
 }
 
@@ -56,25 +57,25 @@ pub enum ScoreError {
         shape: usize,
         /// `true` or `predicted`.
         which: &'static str,
-        /// Labels given.
+        /// Number of labels in the list.
         n_labels: usize,
-        /// Faces of the mesh.
+        /// Number of faces of the mesh.
         n_faces: usize,
     },
-    /// The share of each face cannot be computed.
+    /// The area of a shape allows no shares of its faces.
     #[error("shape {shape} has area {area}, which must be positive and finite")]
     Area {
         /// Position of the shape.
         shape: usize,
-        /// Its total area, as text since it may not be a number.
+        /// Its total area, as text because it may not be a number.
         area: String,
     },
 }
 
-/// Scores the predictions for a collection; every shape weighs 1, whatever its size.
+/// Scores the predictions for a collection. Every shape weighs 1, whatever its size.
 ///
-/// The assignment maximises the pooled area share on its diagonal (Hungarian method). Cost: linear in the
-/// faces, O(m log m) for the connected pieces.
+/// The assignment maximises the pooled area share on its diagonal (Hungarian method). The cost is
+/// linear in the faces, and O(m log m) for the connected pieces.
 pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     if shapes.is_empty() {
         return Err(ScoreError::Empty);
@@ -83,7 +84,7 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     for (i, shape) in shapes.iter().enumerate() {
         shares.push(area_shares(i, shape)?);
     }
-    // One row per predicted label, one column per true one.
+    // One row for each predicted label, one column for each true one.
     let true_labels: Vec<i32> = distinct(shapes.iter().flat_map(|s| s.truth));
     let given = shapes.iter().filter_map(|s| s.predicted).flatten();
     let predicted_labels: Vec<i32> = distinct(given.filter(|&&p| p >= 0));
@@ -145,8 +146,8 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     })
 }
 
-/// Mean over shapes of the area share whose predicted label *is* the true one, without an assignment: for labels that
-/// were named by example.
+/// Returns the mean over shapes of the area share whose predicted label *is* the true one, without
+/// an assignment: for labels whose ids come from training shapes.
 pub fn accuracy_by_id(shapes: &[ScoredShape<'_>]) -> Result<f64, ScoreError> {
     if shapes.is_empty() {
         return Err(ScoreError::Empty);
@@ -172,7 +173,7 @@ fn distinct<'a>(labels: impl Iterator<Item = &'a i32>) -> Vec<i32> {
         .collect()
 }
 
-/// Each face's share of the shape's area, summing to 1.
+/// Returns the share of each face in the shape's area; the shares sum to 1.
 fn area_shares(i: usize, shape: &ScoredShape<'_>) -> Result<Vec<f64>, ScoreError> {
     let n_faces = shape.mesh.faces.len();
     let count = |which, n_labels| ScoreError::Count {
@@ -212,8 +213,9 @@ fn area_shares(i: usize, shape: &ScoredShape<'_>) -> Result<Vec<f64>, ScoreError
     Ok(areas.into_iter().map(|a| a / total).collect())
 }
 
-/// One minus the Rand index of two segmentations of one mesh into connected pieces of equal label: the
-/// share of pairs of faces that are together in one and apart in the other. 0 for fewer than two faces.
+/// Returns one minus the Rand index of two segmentations of one mesh into connected pieces of equal
+/// label: the share of pairs of faces that are in one piece by one of them only. 0 for fewer than
+/// two faces.
 ///
 /// # Panics
 ///
@@ -236,8 +238,8 @@ pub fn rand_error(mesh: &TriMesh, one: &[i32], other: &[i32]) -> f64 {
     (squares(first) / 2.0 + squares(second) / 2.0 - squares(joint)) / (n * (n - 1.0) / 2.0)
 }
 
-/// A piece per face, `(m,)`: faces of equal label that are connected across shared edges, numbered by
-/// their first face.
+/// Returns the piece of each face, `(m,)`: faces of equal label that are connected across shared
+/// edges, numbered by their first face.
 pub fn pieces(faces: &[[u32; 3]], labels: &[i32]) -> Vec<usize> {
     let mut edges: Vec<([u32; 2], usize)> = Vec::with_capacity(3 * faces.len());
     for (f, &[a, b, c]) in faces.iter().enumerate() {
@@ -270,7 +272,7 @@ mod tests {
 
     const TOLERANCE: f64 = 1e-12;
 
-    /// A strip of right triangles along x whose areas are `widths / 2`.
+    /// Builds a strip of right triangles along x whose areas are `widths / 2`.
     fn strip(widths: &[f64]) -> TriMesh {
         let mut mesh = TriMesh {
             vertices: vec![[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
@@ -288,7 +290,7 @@ mod tests {
 
     #[test]
     fn strip_areas_are_the_widths() {
-        // Widths must be measured along the side a triangle has its base on.
+        // Widths must be measured along the side on which a triangle has its base.
         let mesh = strip(&[1.0, 3.0]);
         assert_eq!(mesh.vertices.len(), 4);
         assert_eq!(mesh.faces, [[0, 1, 2], [1, 2, 3]]);
@@ -296,7 +298,7 @@ mod tests {
 
     #[test]
     fn one_assignment_serves_all_shapes() {
-        // Shape 1 agrees up to names; shape 2 uses the names the other way round, so it is wrong.
+        // Shape 1 agrees up to names; shape 2 swaps the names, so it is wrong.
         let mesh = strip(&[1.0, 1.0, 1.0, 1.0]);
         let truth = [0, 0, 1, 1];
         let (p1, p2) = ([7, 7, 3, 3], [3, 3, 7, 3]);
@@ -381,7 +383,8 @@ mod tests {
     fn rand_error_counts_pairs() {
         let mesh = strip(&[1.0; 4]);
         assert_eq!(rand_error(&mesh, &[0, 0, 1, 1], &[5, 5, 2, 2]), 0.0);
-        // One piece against two halves: the 4 pairs across are together in one and apart in the other.
+        // One piece against two halves: the 4 pairs across are together in one and apart in the
+        // other.
         let e = rand_error(&mesh, &[0, 0, 0, 0], &[0, 0, 1, 1]);
         assert!((e - 4.0 / 6.0).abs() < TOLERANCE);
         // Equal labels in separate pieces are separate segments.

@@ -1,4 +1,5 @@
-//! Shapes whose parts are known: strips of faces, each part with descriptors of its own and creases between them.
+//! Test shapes with known parts: strips of faces, whose parts differ in descriptors and meet at
+//! creases.
 
 use super::{DiscoveryInput, Features, ShapeInput};
 use crate::segmentation::{PatchGraph, Surface, SurfaceEdge};
@@ -6,7 +7,7 @@ use rand::{Rng, SeedableRng};
 
 const FACES_A_PATCH: usize = 4;
 const PATCHES_A_PART: usize = 6;
-/// Descriptors and up columns of real shapes, so that group weights apply.
+/// Number of descriptor columns of real shapes with up columns, so that group weights apply.
 const DIM: usize = 92;
 
 /// Strips of equal parts, and the part of each face of every strip.
@@ -16,7 +17,8 @@ pub(super) struct Strips {
 }
 
 impl Strips {
-    /// `n` strips of `k` parts; descriptors of a part spread by `noise` around its own.
+    /// Builds `n` strips of `k` parts. Descriptors of a part spread by `noise` around the part's
+    /// mean.
     pub(super) fn new(n: usize, k: usize, noise: f32) -> Self {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(3);
         let m = k * PATCHES_A_PART * FACES_A_PATCH;
@@ -74,7 +76,8 @@ impl Strips {
         }
     }
 
-    /// Share of the faces, all strips equal, that labels get right up to one renaming.
+    /// Returns the share of faces whose label is right up to one renaming; all strips have the same
+    /// parts.
     pub(super) fn right(&self, labels: &[Vec<u32>]) -> f64 {
         let k = 1 + self.truth.iter().max().map_or(0, |t| *t as usize);
         let mut cost = vec![0.0; k * k];

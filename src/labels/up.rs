@@ -1,24 +1,27 @@
-//! Shapes of one class that share a frame become an estimate of which way is up.
+//! Shapes of one class that share a frame become an estimate of the up axis.
 //!
-//! What stands has a wide base under its centre of mass (Fu, Cohen-Or, Dror and Sheffer 2008, *Upright Orientation
-//! of Man-Made Objects*). Each shape votes for the signed coordinate axis along which it stands best.
+//! An object that stands has a wide base under its centre of mass (Fu, Cohen-Or, Dror and Sheffer
+//! 2008, *Upright Orientation of Man-Made Objects*). Each shape votes for the signed coordinate
+//! axis along which it stands best.
 
 use crate::description::DescriptionView;
 
 /// Share of the height that counts as the base.
 const BASE: f64 = 0.03;
-/// Worth of a base that the centre of mass is not above.
+/// Factor of the score if the centre of mass is not above the base.
 const UNSTABLE: f64 = 0.2;
-/// Least share of the shapes that must agree; of six axes one gets a sixth by chance.
+/// Least share of the shapes that must agree. By chance, one of six axes would get a sixth.
 const LEAST_AGREEMENT: f64 = 0.5;
 
-/// A shape stands clearly better along another axis from this ratio of the two scores on. Tables stand about twice as well on
-/// their plate as on their feet; of chairs that lie on a side, more than half stand three times as well on their feet.
+/// Ratio of two scores from which on a shape stands clearly better along the other axis. Tables
+/// stand about twice as well on their plate as on their feet; of chairs that lie on a side, more
+/// than half stand three times as well on their feet.
 const CLEARLY: f64 = 3.0;
-/// Fewest shapes that can contradict a given axis: a single one that lies on its side is no mistake of the collection.
+/// Least number of shapes that can contradict a given axis. A single shape that lies on its side
+/// says nothing about the collection.
 const LEAST_SHAPES: usize = 3;
 
-/// The axis that most shapes of a collection stand along.
+/// The axis along which most shapes of a collection stand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpVote {
     /// A unit vector: a coordinate axis or its opposite.
@@ -28,19 +31,21 @@ pub struct UpVote {
 }
 
 impl UpVote {
-    /// The axis, unless fewer than half of the shapes agree.
+    /// Returns the axis, unless fewer than half of the shapes agree.
     pub fn trusted(&self) -> Option<[f64; 3]> {
         (self.agreement >= LEAST_AGREEMENT).then_some(self.axis)
     }
 }
 
-/// The axis that most shapes stand along, and how many agree; `None` without shapes.
+/// Returns the axis along which most shapes stand, and the share that agrees; `None` without
+/// shapes.
 pub fn estimate_up<'a>(shapes: impl Iterator<Item = &'a DescriptionView<'a>>) -> Option<UpVote> {
     vote(shapes, |_, _| true)
 }
 
-/// The axis other than `given` along which most shapes stand clearly better, and their share of all; `None` if there are
-/// too few shapes to say. The given axis is probably wrong where this is [trusted](UpVote::trusted).
+/// Returns the axis other than `given` along which most shapes stand clearly better, and their
+/// share of all; `None` if there are too few shapes. If the vote is [trusted](UpVote::trusted), the
+/// given axis is probably wrong.
 pub fn contradicting_up<'a>(given: [f64; 3], shapes: &[&'a DescriptionView<'a>]) -> Option<UpVote> {
     let at = axes().iter().position(|axis| *axis == given)?;
     let better =
@@ -58,7 +63,8 @@ fn axes() -> [[f64; 3]; 6] {
     })
 }
 
-/// The axis that gets most votes, and their share; each shape votes for the axis along which it stands best, if that `counts`.
+/// Returns the axis with most votes, and its share. Each shape votes for the axis along which it
+/// stands best, if `counts` accepts the scores.
 fn vote<'a>(
     shapes: impl Iterator<Item = &'a DescriptionView<'a>>,
     counts: impl Fn(&[f64; 6], usize) -> bool,
@@ -87,8 +93,8 @@ fn vote<'a>(
     })
 }
 
-/// Area of the base's convex hull over that of the whole outline, seen from above; less where the centre of mass is
-/// not above the base.
+/// Returns how well a shape stands along an axis: the area of the convex hull of its base relative
+/// to that of the whole outline, seen from above; less if the centre of mass is not above the base.
 fn standing(shape: &DescriptionView<'_>, axis: [f64; 3]) -> f64 {
     let k = (0..3).find(|c| axis[*c] != 0.0).unwrap_or(0);
     let (u, v) = ((k + 1) % 3, (k + 2) % 3);
@@ -126,7 +132,7 @@ fn turn(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 }
 
-/// Convex hull, counter-clockwise (Andrew's monotone chain).
+/// Computes the convex hull, counter-clockwise (Andrew's monotone chain).
 fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
     points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     points.dedup();
@@ -174,7 +180,7 @@ mod tests {
     use super::*;
     use crate::description::Description;
 
-    /// A pyramid of square base and height 2 along `axis`.
+    /// Builds a pyramid with a square base and height 2 along `axis`.
     fn pyramid(axis: usize, sign: f32) -> Description {
         let mut vertices = Vec::new();
         for (a, b) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
@@ -225,9 +231,9 @@ mod tests {
         let vote = contradicting_up(x, &views).unwrap();
         assert_eq!((vote.trusted(), vote.agreement), (Some(y), 0.75));
         assert_eq!(contradicting_up(down, &views).unwrap().trusted(), Some(y));
-        // One shape of four is no mistake of the collection.
+        // One shape of four says nothing about the collection.
         assert_eq!(contradicting_up(y, &views).unwrap().trusted(), None);
-        // Two shapes are too few, and so are axes between the coordinates.
+        // Two shapes are too few, and `given` must be a coordinate axis.
         assert_eq!(contradicting_up(x, &views[..2]), None);
         assert_eq!(contradicting_up([0.6, 0.8, 0.0], &views), None);
     }

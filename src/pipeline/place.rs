@@ -1,5 +1,6 @@
-//! A description and a snapshot of the library become labels: carried through functional maps from a few known
-//! shapes, weighed against what the collection has fitted of its labels, and cut along creases.
+//! A description and a snapshot of the library become labels. Functional maps transfer labels from
+//! a few known shapes as votes; these are combined with the label model of the collection, and a
+//! cut places boundaries along creases.
 
 use super::DescriptionView;
 use crate::fmap::{
@@ -12,23 +13,23 @@ use crate::linalg::nearest::nearest_rows;
 use crate::segmentation::Surface;
 use std::sync::Arc;
 
-/// Probabilities below this count as this: one source must not veto what all others say.
+/// Probabilities below this count as this, so that one source cannot veto all others.
 pub(super) const FLOOR: f64 = 0.02;
-/// Share of the carried vote, the rest being the label model's, in the log-linear mean.
+/// Share of the votes in the log-linear mean with the label model.
 const VOTE_SHARE: f64 = 0.5;
-/// A vote weighs, at each vertex, this power of the odds that it is right there.
+/// The weight of a vote at a vertex is this power of the odds that it is right there.
 const ODDS_POWER: f64 = 2.0;
-/// Confidence beyond which nobody is believed more, or less than one minus which, less.
+/// Confidence is clamped to this value and to one minus this value.
 const MOST_CERTAIN: f64 = 0.98;
 
-/// A shape with what labelling derives from its description under a label model.
+/// A shape with the values that labelling derives from its description under a label model.
 #[derive(Debug, Clone)]
 pub struct Prepared {
     /// Its dual graph.
     pub surface: Arc<Surface>,
     /// Standardised face descriptors `(m, dim)`.
     pub features: Features,
-    /// The same at its vertices `(n, dim)`.
+    /// Standardised descriptors at the vertices `(n, dim)`.
     pub at_vertices: Vec<f32>,
 }
 
@@ -38,7 +39,7 @@ impl Prepared {
         Self::on(Arc::new(Surface::new(&shape.mesh())), shape, model)
     }
 
-    /// Prepares a shape whose surface is known.
+    /// Prepares a shape whose surface was computed before.
     pub fn on(surface: Arc<Surface>, shape: &DescriptionView<'_>, model: &LabelModel) -> Self {
         let features = model
             .normalisation
@@ -64,7 +65,8 @@ impl Prepared {
     }
 }
 
-/// Computes the functional map that carries functions, and so labels, from one shape to another.
+/// Computes the functional map that carries functions, and therefore labels, from one shape to
+/// another.
 pub fn map(
     from: (&DescriptionView<'_>, &Prepared),
     to: (&DescriptionView<'_>, &Prepared),
@@ -73,7 +75,8 @@ pub fn map(
     descriptor_zoomout(&from.1.map_shape(from.0), &to.1.map_shape(to.0), options)
 }
 
-/// As [`map`], grown from a given map `c_12 (k, k1)` in the place of nearest neighbours of descriptors.
+/// Computes a map like [`map`], but starts from a map `c_12 (k, k1)` instead of nearest neighbours
+/// of descriptors.
 pub fn map_from(
     from: (&DescriptionView<'_>, &Prepared),
     to: (&DescriptionView<'_>, &Prepared),
@@ -84,7 +87,8 @@ pub fn map_from(
     descriptor_zoomout_from(&one, &two, start, options)
 }
 
-/// What maps are compared with: for each vertex of a shape the most alike vertex of a known one, and what to expect of it.
+/// Returns the baseline of maps: for each vertex of a shape the vertex of a known one with the
+/// nearest descriptors, and the expected correctness.
 pub fn map_by_descriptors(
     from: (&DescriptionView<'_>, &Prepared),
     to: (&DescriptionView<'_>, &Prepared),
@@ -92,9 +96,9 @@ pub fn map_by_descriptors(
     nearest_descriptors(&from.1.map_shape(from.0), &to.1.map_shape(to.0))
 }
 
-/// How unlike a known shape is to another, by whatever vertices of it look most alike: mean squared descriptor difference
-/// between some vertices of the shape and the most alike of some of the known one. Predicts which maps carry labels well,
-/// without one. About `2 · 200 · 600 · dim` flops.
+/// Returns the mean squared difference of descriptors between a sample of a shape's vertices and
+/// the most similar of a sample of a known shape's vertices. It predicts which maps transfer labels
+/// well, without computing one. About `2 · 200 · 600 · dim` flops.
 pub fn descriptor_distance(known: &Prepared, shape: &Prepared) -> f64 {
     const N_COMPARED: (usize, usize) = (600, 200);
     let dim = shape.features.dim;
@@ -129,9 +133,9 @@ pub struct Vote<'a> {
     pub probabilities: &'a [u8],
     /// For each vertex of the shape being labelled a vertex of the known one.
     pub p2p: &'a [u32],
-    /// What to expect of the map at each vertex.
+    /// Expected correctness of the map at each vertex.
     pub confidence: &'a Confidence,
-    /// How much its labels are believed: 1 if they were carried, more if a person gave them.
+    /// Factor of the vote's weight: 1 if its labels were propagated, more if a person gave them.
     pub trust: f64,
 }
 
@@ -140,14 +144,15 @@ pub struct Vote<'a> {
 pub struct Labelling {
     /// Class of each face `(m,)`.
     pub classes: Vec<u32>,
-    /// Probability of each class for each face `(m, k)`, 0 to 255: half the evidence, half the cut.
+    /// Probability of each class for each face `(m, k)`, 0 to 255: the mean of the evidence and the
+    /// result of the cut.
     pub probabilities: Vec<u8>,
-    /// Weight of each vote, summing to 1 (empty without votes).
+    /// Weight of each vote; the weights sum to 1. Empty without votes.
     pub weights: Vec<f64>,
 }
 
 impl Labelling {
-    /// The labelling that `classes` and the evidence `posterior (m, k)` make.
+    /// Combines `classes` and the evidence `posterior (m, k)`.
     pub(super) fn new(classes: Vec<u32>, posterior: &[f64], weights: Vec<f64>, k: usize) -> Self {
         let probabilities = posterior
             .iter()
@@ -164,7 +169,7 @@ impl Labelling {
         }
     }
 
-    /// A labelling that is given, with the label model's opinion as evidence.
+    /// Makes a labelling of given classes, with the label model as evidence.
     pub fn given(classes: Vec<u32>, prepared: &Prepared, model: &LabelModel) -> Self {
         let k = model.labels.len();
         let log = model
@@ -175,14 +180,15 @@ impl Labelling {
         Self::new(classes, &posterior, Vec::new(), k)
     }
 
-    /// What this shape adds to the label model.
+    /// Returns the statistics that this shape adds to the label model.
     pub fn statistics(&self, prepared: &Prepared, k: usize) -> Statistics {
         let class = |f: usize| Some(self.classes[f]);
         Statistics::of_shape(&prepared.features, &prepared.surface.area, class, k)
     }
 }
 
-/// Labels a shape from votes and the label model: a vote and a cut, no spectrum, no new map.
+/// Labels a shape from votes and the label model, with one cut. Computes neither a spectrum nor a
+/// map.
 pub fn label(
     shape: &DescriptionView<'_>,
     prepared: &Prepared,
@@ -205,8 +211,9 @@ pub fn label(
     Labelling::new(classes, &posterior, weights, k)
 }
 
-/// What each class of each face costs `(m, k)`: the log-linear mean of the carried votes, of this share, and the label
-/// model's `log_model`; the latter alone where nothing was carried.
+/// Returns the cost of each class for each face `(m, k)`: the log-linear mean of the votes, which
+/// have the share `share`, and the label model's `log_model`; or the latter alone where there is no
+/// vote.
 pub(super) fn blended(log_model: &[f64], voted: &[f64], share: f64, k: usize) -> Vec<f64> {
     let mut unary = Vec::with_capacity(log_model.len());
     for (f, row) in log_model.chunks_exact(k).enumerate() {
@@ -223,8 +230,8 @@ pub(super) fn blended(log_model: &[f64], voted: &[f64], share: f64, k: usize) ->
     unary
 }
 
-/// Label probabilities of each face `(m, k)` by the votes, 0 where nothing corresponds, and the share of each vote in all
-/// of them.
+/// Returns the label probabilities of each face `(m, k)` by the votes, 0 where nothing corresponds,
+/// and the share of each vote in the total.
 pub fn vote_probabilities(
     shape: &DescriptionView<'_>,
     votes: &[Vote<'_>],
@@ -274,7 +281,7 @@ pub fn vote_probabilities(
     (faces, weights)
 }
 
-/// Probabilities at the vertices of a known shape: means over the faces around each.
+/// Returns probabilities at the vertices of a known shape: means over the adjacent faces.
 fn vertex_probabilities(vote: &Vote<'_>, k: usize) -> Vec<f64> {
     let n = vote
         .faces

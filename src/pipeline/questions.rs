@@ -1,44 +1,42 @@
-//! Parts of a collection's shapes, some labelled by a person, become the part whose label is worth
-//! most to ask for.
+//! Chooses the part of a collection's shapes whose label is most worth asking a person for.
 //!
-//! A part is what is left when a shape's patches are merged until [`N_PARTS`] remain. Parts are
-//! compared by their mean descriptors, in the metric of the scatter within discovered labels. An
-//! answer is expected to decide the parts that are like the one asked for, as far as they are in
-//! doubt and no earlier answer is as near: greedy facility location (Nemhauser, Wolsey and Fisher
-//! 1978, *An Analysis of Approximations for Maximizing Submodular Set Functions*), weighted by area
-//! and doubt. A part whose patches seem to have different labels is worth less, because its answer
-//! is wrong for some of them. All this comes from a model of patches alone, so that the next
-//! question does not wait until an answer has been propagated to faces, and is the same whether it
-//! has or not.
+//! The patches of each shape are merged until [`N_PARTS`] parts remain. Parts are compared by their
+//! mean descriptors, in the metric of the scatter within discovered labels. An answer is expected
+//! to decide the parts that are similar to the one asked about, as far as they are in doubt and no
+//! earlier answer is as near: greedy facility location (Nemhauser, Wolsey and Fisher 1978, *An
+//! Analysis of Approximations for Maximizing Submodular Set Functions*), weighted by area and
+//! doubt. A part whose patches seem to have different labels is worth less, because its answer is
+//! wrong for some of them. All this follows from a model of patches alone, so the next question
+//! neither waits for an answer to be propagated to faces nor depends on it.
 
 use super::DescriptionView;
 use crate::labels::{Features, Normalisation, Statistics};
 use crate::segmentation::{PatchGraph, Surface, merge_patches};
 use nalgebra::{Cholesky, DMatrix};
 
-/// Parts that a shape is divided into for questions.
+/// Number of parts into which a shape is divided for questions.
 pub const N_PARTS: usize = 16;
-/// Likeliest labels that a question offers.
+/// Number of most likely labels that a question offers.
 pub const N_OFFERED: usize = 3;
-/// What a part counts, at least, of whose label the model is certain: it may be wrong all the same.
+/// Least doubt of a part: the model may be wrong even where it is certain.
 const LEAST_DOUBT: f64 = 0.05;
-/// What a question is worth whose own answer is certain, against one of which nothing is known.
+/// Worth of a question whose own answer is certain, relative to one about which nothing is known.
 const WORTH_OF_CERTAIN: f64 = 0.1;
 /// Training shapes that the discovered labels are worth, as in propagation.
 const PRIOR_SHAPES: f64 = 2.0;
-/// Temperature of both classifiers, which are fitted on little.
+/// Temperature of both classifiers, which are fitted to little data.
 const TEMPERATURE: f64 = 2.0;
-/// Share of a shape's area that must be answered of a discovered label until that is known as much
+/// Share of a shape's area that must be answered for a discovered label before it is as much known
 /// as unknown.
 const UNSEEN_AREA: f64 = 0.02;
-/// Least probability that counts, as one source must not veto what the other says.
+/// Probabilities below this count as this, so that one source cannot veto the other.
 const FLOOR: f64 = 0.02;
-/// Share of the mean variance that is mixed into the scatter, as a metric.
+/// Share of the mean variance that is mixed into the scatter for the metric.
 const RIDGE: f64 = 0.1;
-/// The kernel's width is the distance to the neighbour of this rank in other shapes, in the median.
+/// Rank of the neighbour in other shapes whose median distance is the width of the kernel.
 const NEIGHBOUR: usize = 4;
 
-/// A shape as questions see it, by its description alone.
+/// The parts of a shape, as questions use them. They follow from its description alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShapeParts {
     /// Part of each proxy face `(m,)`.
@@ -47,14 +45,14 @@ pub struct ShapeParts {
     pub part_of_patch: Vec<u32>,
     /// Area share of each patch.
     pub patch_area: Vec<f64>,
-    /// Mean descriptors of each patch `(n_patches, dim)`, as they are in the description.
+    /// Mean descriptors of each patch `(n_patches, dim)`, not standardised.
     pub patch_means: Vec<f32>,
 }
 
 impl ShapeParts {
-    /// The parts of a shape; `up` is the collection's up axis, if it is known. Patches are merged
-    /// by descriptors that are standardised over the shape itself, so that its parts do not depend
-    /// on other shapes.
+    /// Divides a shape into parts; `up` is the collection's up axis, if known. Patches are merged
+    /// by descriptors that are standardised over the shape itself, so its parts do not depend on
+    /// other shapes.
     pub fn new(shape: &DescriptionView<'_>, up: Option<[f64; 3]>) -> Self {
         let surface = Surface::new(&shape.mesh());
         let raw = Features::raw(shape, up);
@@ -85,21 +83,21 @@ impl ShapeParts {
     }
 }
 
-/// A shape whose parts may be asked for.
+/// A shape about whose parts a person may be asked.
 #[derive(Debug, Clone, Copy)]
 pub struct CandidateShape<'a> {
     /// Its parts.
     pub parts: &'a ShapeParts,
     /// Area that a person gave to each class in each part `(p, k)`, in shares of the shape.
     pub labelled: &'a [f64],
-    /// Whether each part may be asked for `(p,)`.
+    /// Whether each part may be asked about `(p,)`.
     pub open: &'a [bool],
 }
 
-/// What a collection has learnt that bears on questions.
+/// What a collection knows that bears on questions.
 #[derive(Debug, Clone, Copy)]
 pub struct Background<'a> {
-    /// What standardises descriptors.
+    /// Standardises descriptors.
     pub normalisation: &'a Normalisation,
     /// Statistics of the `n` discovered labels.
     pub discovered: &'a Statistics,
@@ -107,24 +105,24 @@ pub struct Background<'a> {
     pub k: usize,
 }
 
-/// The part to ask for.
+/// A part that a person is asked about.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Question {
     /// Index of its shape.
     pub shape: usize,
     /// Index of the part among those of its shape.
     pub part: u32,
-    /// Area that its answer is expected to decide, in shapes.
+    /// Area that its answer is expected to decide, in units of a shape's area.
     pub gain: f64,
-    /// Probability that its likeliest class is wrong.
+    /// Probability that its most likely class is wrong.
     pub doubt: f64,
-    /// The likeliest classes with their probabilities: below k those of the person, from k on
-    /// discovered labels that nobody has given a meaning.
+    /// The most likely classes with their probabilities. Below k they are the person's classes;
+    /// from k on they are discovered labels that nobody has named.
     pub likeliest: Vec<(usize, f64)>,
 }
 
-/// The part whose answer is worth most; `None` if none is open. Costs the square of the number of
-/// parts.
+/// Returns the part whose answer is worth most; `None` if no part is open. Costs the square of the
+/// number of parts.
 pub fn next_question(shapes: &[CandidateShape<'_>], known: &Background<'_>) -> Option<Question> {
     if !shapes.iter().any(|s| s.open.contains(&true)) {
         return None;
@@ -172,15 +170,15 @@ struct PartModel {
     /// Standardised mean descriptors `(n_parts, dim)`.
     means: Vec<f64>,
     dim: usize,
-    /// Mean probability over the patches that the likeliest class of a person is wrong.
+    /// Mean over the patches of the probability that the person's most likely class is wrong.
     doubt: Vec<f64>,
-    /// Share of the area whose patches have the label of most, on average of the discovered labels
+    /// Share of the area whose patches have the most common label, averaged over discovered labels
     /// and the person's.
     purity: Vec<f64>,
-    /// Columns of `probabilities`.
+    /// Number of columns of `probabilities`.
     width: usize,
-    /// Mean probabilities over the patches `(n_parts, k + n)`: the person's classes, and discovered
-    /// labels as far as nobody has named them.
+    /// Mean probabilities over the patches `(n_parts, k + n)`: of the person's classes, then of
+    /// discovered labels as far as nobody has named them.
     probabilities: Vec<f64>,
 }
 
@@ -255,16 +253,16 @@ impl PartModel {
         classes
     }
 
-    /// Likeness of every two parts `(n, n)`, 0 to 1: `exp(−d²/h)`, d the distance of their means in
-    /// the metric of the scatter within discovered labels, h the median of d² to a near part of
-    /// another shape.
+    /// Returns the similarity of every two parts `(n, n)`, 0 to 1: `exp(−d²/h)`, where d is the
+    /// distance of their means in the metric of the scatter within discovered labels, and h is the
+    /// median of d² to a near part of another shape.
     fn kernel(&self, discovered: &Statistics) -> DMatrix<f64> {
         let (n, dim) = (self.area.len(), self.dim);
         let scatter = discovered.scatter_within();
         let ridge = RIDGE * scatter.trace() / dim as f64;
         let metric = scatter * (1.0 - RIDGE) + DMatrix::identity(dim, dim) * ridge.max(1e-9);
         let columns = DMatrix::from_column_slice(dim, n, &self.means);
-        // The ridge keeps the metric positive definite, but for statistics of nothing.
+        // The ridge makes the metric positive definite, except for statistics without faces.
         let white = Cholesky::new(metric).and_then(|f| f.l().solve_lower_triangular(&columns));
         let white = white.unwrap_or(columns);
         let norms: Vec<f64> = white.column_iter().map(|c| c.norm_squared()).collect();
@@ -287,12 +285,12 @@ impl PartModel {
     }
 }
 
-/// What is believed of each patch.
+/// Estimated labels of each patch.
 struct Patches {
     width: usize,
     /// `(n_patches, k + n)`: as in [`PartModel`].
     probabilities: Vec<f64>,
-    /// The likeliest discovered label of each.
+    /// The most likely discovered label of each.
     found: Vec<usize>,
 }
 
@@ -324,7 +322,8 @@ impl Patches {
                 row[k + label] = p * of_label[k];
             }
             let named: f64 = row[..k].iter().sum();
-            // The geometric mean of what the discovered label means and what the patch is like.
+            // The geometric mean of the meaning of the discovered labels and the person's
+            // classifier.
             for (class, slot) in row[..k].iter_mut().enumerate() {
                 let meant = (*slot / named.max(1e-12)).max(FLOOR);
                 *slot = meant.sqrt() * (0.5 * log_person[i * k + class]).exp();
@@ -341,8 +340,8 @@ impl Patches {
         }
     }
 
-    /// Share of the area of some patches that has the label of most, on average of discovered
-    /// labels and the person's.
+    /// Returns the share of the area of some patches that has their most common label, averaged
+    /// over discovered labels and the person's.
     fn purity(&self, members: &[(usize, f64)], k: usize) -> f64 {
         let share = |label: &dyn Fn(usize) -> usize| {
             let mut area = vec![0.0; self.width];
@@ -361,14 +360,14 @@ impl Patches {
     }
 }
 
-/// Index of the largest value, the first of equal ones.
+/// Returns the index of the largest value; of equal ones the first.
 fn largest(row: &[f64]) -> usize {
     let order = |a: &usize, b: &usize| row[*a].total_cmp(&row[*b]).then(b.cmp(a));
     (0..row.len()).max_by(order).unwrap_or(0)
 }
 
-/// Area that a person gave to each class in each patch `(n_patches, k)`: what a part has, spread
-/// over its patches.
+/// Returns the area that a person gave to each class in each patch `(n_patches, k)`: that of each
+/// part, spread over its patches.
 fn labelled_patches(shapes: &[CandidateShape<'_>], k: usize) -> Vec<f64> {
     let mut out = Vec::new();
     for shape in shapes {
@@ -390,8 +389,8 @@ fn labelled_patches(shapes: &[CandidateShape<'_>], k: usize) -> Vec<f64> {
     out
 }
 
-/// What each discovered label means `(n, k + 1)`: probabilities of the person's classes, and that
-/// nobody has named it.
+/// Returns the meaning of each discovered label `(n, k + 1)`: probabilities of the person's
+/// classes, then the probability that nobody has named it.
 fn meaning(labelled: &[f64], found: &[f64], (k, n): (usize, usize)) -> Vec<f64> {
     let mut both = vec![0.0; n * (k + 1)];
     if k > 0 {
@@ -411,8 +410,8 @@ fn meaning(labelled: &[f64], found: &[f64], (k, n): (usize, usize)) -> Vec<f64> 
     both
 }
 
-/// Statistics of the person's classes: the labelled patches, and the discovered labels by their
-/// meaning as a prior.
+/// Computes statistics of the person's classes from the labelled patches, with the discovered
+/// labels, translated by their meaning, as a prior.
 fn person_statistics(
     labelled: &[f64],
     features: &Features,

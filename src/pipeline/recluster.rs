@@ -1,5 +1,5 @@
-//! A few representative shapes are labelled together: the start of a collection's labels, and their revision as
-//! the collection grows.
+//! Labels a few representative shapes together: at the start of a collection, and again as it
+//! grows.
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
@@ -11,41 +11,42 @@ use crate::segmentation::{PatchGraph, Surface};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// A representative shape and the labels its faces carry now.
+/// A representative shape and the current labels of its faces.
 #[derive(Debug, Clone, Copy)]
 pub struct Representative<'a> {
     /// Its arrays.
     pub shape: DescriptionView<'a>,
-    /// Label id of each proxy face `(m,)`, ids of the old model; not read where there is none.
+    /// Label id of each proxy face `(m,)`, ids of the old model; ignored without one.
     pub labels: &'a [u32],
 }
 
-/// What re-clustering is asked for.
+/// Parameters of a re-clustering.
 #[derive(Debug, Clone)]
 pub struct ReclusterOptions {
     /// Number of labels and seed.
     pub discovery: DiscoveryOptions,
     /// The up axis, if known.
     pub up: Option<[f64; 3]>,
-    /// A new labelling is taken only if its value is higher by more than this; negative infinity takes it whatever its value.
+    /// A new labelling is accepted only if its value is higher by more than this. With negative
+    /// infinity it is accepted whatever its value.
     pub min_gain: f64,
-    /// First label id that was never used.
+    /// The first label id that was never used.
     pub next_label: u32,
 }
 
-/// A label that was found to be part of another, or several.
+/// A change of label ids in a re-clustering.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LabelChange {
-    /// A label id came into being.
+    /// A label id was created.
     Created(u32),
-    /// `from` is retired and stands for `into`.
+    /// `from` was retired and stands for `into`.
     Merged {
         /// The retired id.
         from: u32,
         /// The id that stands for both.
         into: u32,
     },
-    /// Part of `from` is `into` now.
+    /// Part of `from` became `into`.
     Split {
         /// The id that keeps the larger share.
         from: u32,
@@ -57,20 +58,21 @@ pub enum LabelChange {
 /// The outcome of a re-clustering.
 #[derive(Debug, Clone)]
 pub struct Reclustering {
-    /// Score of the labels as they were (negative infinity if there were none) and of the new ones.
+    /// Values of the current labels (negative infinity if there were none) and of the new ones.
     pub scores: (f64, f64),
-    /// Whether the new labels were taken.
+    /// Whether the new labels were accepted.
     pub accepted: bool,
-    /// What happened to label ids.
+    /// Changes of label ids.
     pub changes: Vec<LabelChange>,
-    /// The model the representatives make with the labels they have now.
+    /// The model that the representatives make with the accepted labels, or with the current ones.
     pub model: LabelModel,
     /// Labelling of each representative under that model.
     pub labellings: Vec<Labelling>,
 }
 
-/// Clusters the parts of the representatives anew and decides whether that is better than what there is. In either
-/// case the label model is made anew from the representatives, with descriptors standardised over them.
+/// Clusters the parts of the representatives again, and accepts the new labels if their value is
+/// higher than that of the current ones. In either case the label model is rebuilt from the
+/// representatives, with descriptors standardised over them.
 pub fn recluster(
     shapes: &[Representative<'_>],
     old: Option<&LabelModel>,
@@ -180,7 +182,8 @@ impl Together {
     }
 }
 
-/// Labels of the proxy faces of shapes that are all known from the start, by discovery or by a baseline.
+/// Returns labels of the proxy faces of shapes that are all known from the start, by discovery or
+/// by a baseline.
 pub fn batch(
     shapes: &[DescriptionView<'_>],
     n_labels: usize,
@@ -199,7 +202,7 @@ pub fn batch(
     }
 }
 
-/// The classes of the old model that the representatives' labels are.
+/// Returns the classes of the old model that correspond to the representatives' labels.
 fn current_classes(shapes: &[Representative<'_>], model: &LabelModel) -> Vec<Vec<u32>> {
     let class_of = |label: &u32| model.labels.iter().position(|l| l == label).unwrap_or(0) as u32;
     shapes
@@ -210,8 +213,9 @@ fn current_classes(shapes: &[Representative<'_>], model: &LabelModel) -> Vec<Vec
 
 type Renamed = (Vec<u32>, Vec<Vec<u32>>, Vec<LabelChange>);
 
-/// Gives the classes of a discovery the ids of the old labels they overlap most (one to one, by area); a class that
-/// is left over becomes a new id, a label that is left over is merged into the one that took most of it.
+/// Gives each class of a discovery the id of the old label that it overlaps most (one to one, by
+/// area). A class without an old label gets a new id. An old label without a class is merged into
+/// the one that took most of its area.
 fn rename(
     found: Discovery,
     old: Option<(&[Vec<u32>], &LabelModel)>,
@@ -268,7 +272,7 @@ fn rename(
 mod tests {
     use super::*;
 
-    /// One shape of a few faces of equal area.
+    /// Builds one shape of a few faces of equal area.
     fn faces(n: usize) -> Vec<Prepared> {
         vec![Prepared {
             surface: Arc::new(Surface {
@@ -284,7 +288,8 @@ mod tests {
         }]
     }
 
-    /// What becomes of label ids 10, 11, ... when faces of the classes `current` are found to be of the classes `found`.
+    /// Returns the label ids and changes after faces of the classes `current`, with ids 10, 11,
+    /// ..., were found to be of the classes `found`.
     fn renamed(current: &[u32], found: &[u32]) -> (Vec<u32>, Vec<LabelChange>) {
         let n_classes = |classes: &[u32]| classes.iter().max().map_or(0, |c| *c as usize + 1);
         let model = LabelModel {

@@ -1,7 +1,8 @@
-//! The faces of one label become two labels, by what tells them apart most over the collection.
+//! Splits the faces of one label into two labels, by the difference that is greatest over the
+//! collection.
 //!
-//! Two means of the mean descriptors of its patches say which patches belong together; the linear discriminant of
-//! the two groups and a cut within the label then decide face by face.
+//! k-means with two clusters of the mean descriptors of the label's patches groups the patches. The
+//! linear discriminant of the two groups, and a cut within the label, then decide face by face.
 
 use super::Prepared;
 use crate::labels::cut::{STRENGTH, cut};
@@ -13,8 +14,9 @@ use std::sync::Arc;
 const SEED: u64 = 1;
 const N_STARTS: usize = 10;
 
-/// The discriminant of the two halves of a label, given the shapes, the patch of each of their faces, and which of
-/// these carry the label. The second class is the smaller one. `None`: it has fewer than two patches.
+/// Fits the discriminant of the two halves of a label, from the shapes, the patch of each of their
+/// faces, and whether each face has the label. The second class is the smaller one. Returns `None`
+/// if the label has fewer than two patches.
 pub fn split_model(
     shapes: &[Arc<Prepared>],
     patches: &[&[u32]],
@@ -64,7 +66,7 @@ pub fn split_model(
     Some(statistics.classifier())
 }
 
-/// Which faces `(m,)` of a shape take the new label, among those that carry the old one.
+/// Returns which faces `(m,)` of a shape take the new label, among those that have the old one.
 pub fn split_faces(model: &Classifier, shape: &Prepared, is_in: &[bool]) -> Vec<bool> {
     let inside = shape
         .surface

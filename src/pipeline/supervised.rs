@@ -1,23 +1,28 @@
-//! Faces that a person labelled become the labels of all shapes of a collection.
+//! Labels the shapes of a collection from faces that a person labelled.
 //!
-//! While nothing is labelled by hand, labels are discovered; from the first correction on they come from the
-//! corrected shapes, the exemplars. A few representative shapes learn first, together: votes through maps from
-//! the exemplars, and a linear discriminant that is trained on the exemplars alone, label them; then once more,
-//! with the discriminant trained anew with the confident faces of all of them (Yarowsky 1995, *Unsupervised
-//! Word Sense Disambiguation Rivaling Supervised Methods*), and they vote for each other. What they have
-//! learnt labels every other shape with a vote and a cut: it does not change until the next correction, so the
-//! order in which those are labelled makes no difference.
+//! While no shape is labelled by hand, labels are discovered. From the first correction on, they
+//! come from the corrected shapes, the training shapes. [`fit`] labels a few representative shapes
+//! together and fits a linear discriminant to them. In the first round, votes through maps from the
+//! training shapes and a discriminant fitted to these alone label the representatives. In further
+//! rounds, the discriminant is also fitted to the confident faces of all representatives
+//! (self-training: Yarowsky 1995, *Unsupervised Word Sense Disambiguation Rivaling Supervised
+//! Methods*), and all representatives vote. [`label_fitted`] then labels every other shape with
+//! votes and a cut. The fit does not change until the next correction, so the order in which these
+//! shapes are labelled makes no difference.
 //!
-//! One exemplar shows what its parts are like, but not how much like parts of different shapes differ, nor what a part of
-//! its kind is like on average. Both are taken from the labels that were discovered before. Wrong as some are, descriptors
-//! scatter within them as within true parts; and what each of them means in the person's words, seen by the faces
-//! that both label, says where the means of the person's labels are to be expected: the estimate is that with a conjugate prior
-//! worth so many exemplars (Gauvain and Lee 1994, *Maximum a Posteriori Estimation for Multivariate Gaussian Mixture
-//! Observations of Markov Chains*), which fades as exemplars come. Besides, a shape's own discovered labels, in the person's
-//! words, vote beside those that come through maps, and are believed as far as the person was found to agree with them.
+//! One training shape shows what its parts are like, but neither how much parts of one label differ
+//! between shapes, nor what a part of this label is like on average. The labels that were
+//! discovered before supply both. First, although some of them are wrong, descriptors scatter
+//! within them as within true parts. Second, the meaning of each discovered label in the person's
+//! labels, observed on faces that have both, gives an expectation of the means of the person's
+//! labels. The estimate is that with a conjugate prior worth a number of training shapes (Gauvain
+//! and Lee 1994, *Maximum a Posteriori Estimation for Multivariate Gaussian Mixture Observations of
+//! Markov Chains*), so its influence fades as training shapes are added. In addition, a shape's own
+//! discovered labels, translated into the person's labels, vote beside those that come through
+//! maps. Their weight follows from how often the person agreed with them.
 //!
-//! Before the cut a face's evidence is mixed with the mean over the part of the shape that it is in: a limb is of one label
-//! more often than evidence face by face says.
+//! Before the cut, a face's evidence is mixed with the mean over its part of the shape, because a
+//! limb has one label more often than evidence face by face suggests.
 
 use super::place::{blended, vote_probabilities};
 use super::{DescriptionView, Labelling, Prepared, Vote};
@@ -27,33 +32,34 @@ use crate::labels::{Classifier, Pinned, PriorLabels, Statistics};
 use crate::segmentation::{Surface, parts};
 use rayon::iter::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
-/// Parts that a shape is taken to consist of: so many for each class, and so many more.
+/// Number of parts into which a shape is divided: so many for each class, and so many more.
 const N_PARTS_A_CLASS: usize = 2;
 const N_PARTS_MORE: usize = 4;
 
-/// Weights of teaching.
+/// Weights of the fit, and of labelling by it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FitOptions {
-    /// Rounds in which the representatives learn from each other, after the one in which they learn from the
-    /// exemplars alone.
+    /// Number of rounds after the first, which uses the training shapes alone.
     pub n_rounds: usize,
     /// Share of the vote through maps in the log-linear mean with the discriminant.
     pub vote_share: f64,
-    /// Weight of an exemplar's vote against that of a shape that was labelled by carrying.
+    /// Weight of the vote of a training shape, relative to that of a shape with propagated labels.
     pub training_trust: f64,
-    /// Weight in the discriminant of a face that a person labelled, against one whose label was discovered.
+    /// Weight in the discriminant of a face that a person labelled, relative to one whose label was
+    /// discovered.
     pub pinned_weight: f64,
-    /// Weight of all shapes labelled by carrying together against all exemplars together, in the discriminant.
+    /// Weight in the discriminant of all shapes with propagated labels together, relative to all
+    /// training shapes together.
     pub propagated_weight: f64,
-    /// Least probability of a face that the discriminant is trained on, if no person labelled it.
+    /// Least probability of a face to which the discriminant is fitted, if no person labelled it.
     pub confident: f64,
-    /// Exemplars that tell as much as the labels that were discovered, of where the labels' means are and of how
-    /// descriptors scatter around them: with n exemplars, what was discovered has `discovered_worth /
-    /// (discovered_worth + n)` of the say.
+    /// Number of training shapes that the discovered labels are worth, for the means of the labels
+    /// and for the scatter of descriptors around them. With n training shapes, the discovered
+    /// labels have the share `discovered_worth / (discovered_worth + n)`.
     pub discovered_worth: f64,
-    /// Temperature of the discriminant, which is trained on few shapes and too certain.
+    /// Temperature of the discriminant, which is too certain because it is fitted to few shapes.
     pub temperature: f64,
-    /// Share, in what each class of a face costs, of the mean over the part that the face is in.
+    /// Share of the mean over a face's part in the cost of each class.
     pub part_share: f64,
     /// Boundary strength of the cut.
     pub strength: f64,
@@ -76,57 +82,62 @@ impl Default for FitOptions {
     }
 }
 
-/// A representative shape that learns, and teaches the others.
+/// A representative shape to which the model is fitted.
 #[derive(Debug, Clone, Copy)]
 pub struct FitShape<'a> {
     /// Its arrays.
     pub shape: DescriptionView<'a>,
-    /// What is derived from them under the collection's normalisation.
+    /// The shape, prepared under the collection's normalisation.
     pub prepared: &'a Prepared,
-    /// Class of each face that a person labelled `(m,)`; empty if none is.
+    /// Class of each face that a person labelled `(m,)`; empty if there is none.
     pub pinned: &'a [Option<u32>],
-    /// Probabilities `(m, k)`, 0 to 255, of labels that were discovered and still count; empty if none do.
+    /// Probabilities `(m, k)`, 0 to 255, of discovered labels that still count; empty if there are
+    /// none.
     pub discovered: &'a [u8],
 }
 
-/// A map between two members.
+/// A map between two shapes of the fit.
 #[derive(Debug, Clone, Copy)]
 pub struct FitMap<'a> {
-    /// Labels are carried from this member
+    /// Index of the shape that votes.
     pub from: usize,
-    /// to this one.
+    /// Index of the shape that it votes for.
     pub to: usize,
     /// For each vertex of `to` a vertex of `from`.
     pub p2p: &'a [u32],
-    /// What to expect of the map at each vertex of `to`.
+    /// Expected correctness of the map at each vertex of `to`.
     pub confidence: &'a Confidence,
 }
 
-/// What the representatives have learnt.
+/// The result of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fitted {
-    /// What makes the discriminant.
+    /// Statistics that make the discriminant.
     pub statistics: Statistics,
-    /// What the labels that were discovered before mean now.
+    /// The labels that were discovered before, with their meaning in the person's classes.
     pub prior: Option<PriorLabels>,
-    /// Labelling of each member.
+    /// Labelling of each shape of the fit.
     pub labellings: Vec<Labelling>,
 }
 
-/// What counts besides the members.
+/// Evidence besides the shapes of the fit.
 #[derive(Debug, Clone, Copy)]
 pub struct FurtherEvidence<'a> {
-    /// Statistics of faces that were labelled: pinned ones of further exemplars, and discovered ones that still count.
+    /// Statistics of labelled faces elsewhere: pinned faces of further training shapes, and faces
+    /// with discovered labels that still count.
     pub statistics: &'a Statistics,
-    /// Training shapes, those among the members included: each counts by the share of its area that is pinned.
+    /// Number of training shapes, including those of the fit. Each counts by the share of its area
+    /// that is pinned.
     pub n_training: f64,
-    /// Statistics of the labels that were discovered before anything was labelled, over many shapes, where they count
-    /// no more themselves: what parts are like on average, and how like parts of different shapes differ, of which a few
-    /// exemplars say little.
+    /// Statistics, over many shapes, of labels that were discovered before a person labelled
+    /// anything, where shapes cannot have these labels any more. They show what parts are like on
+    /// average and how much parts of one label differ between shapes, which a few training shapes
+    /// do not show.
     pub discovered: Option<&'a Statistics>,
 }
 
-/// Teaches the members `k` classes. Costs a cut for each member and round.
+/// Fits a model of `k` classes to some shapes and labels them. Costs a cut for each shape and
+/// round.
 pub fn fit(
     members: &[FitShape<'_>],
     maps: &[FitMap<'_>],
@@ -222,8 +233,9 @@ pub fn fit(
     }
 }
 
-/// Labels a shape from what was taught: votes through maps from exemplars and representatives, and of the labels that were
-/// discovered before; the discriminant that `statistics` make; and the faces a person labelled, which keep their class.
+/// Labels a shape by a fit. The evidence is the votes through maps from training shapes and
+/// representatives, the vote of the shape's own discovered labels, and the discriminant of
+/// `statistics`. Faces that a person labelled keep their class.
 pub fn label_fitted(
     shape: &DescriptionView<'_>,
     prepared: &Prepared,
@@ -244,8 +256,8 @@ pub fn label_fitted(
     labelled(shape, prepared, &evidence, k, options)
 }
 
-/// Classes of proxy faces `(m,)`, given those of the polygons `(n_polygons,)`: a face is pinned if most of the area that
-/// it stands for is, to the class of most of that.
+/// Converts classes of polygons `(n_polygons,)` to classes of proxy faces `(m,)`. A face is pinned
+/// if most of the area that it stands for is pinned, to the class of most of that area.
 pub fn proxy_pins(
     shape: &DescriptionView<'_>,
     polygon_class: &[Option<u32>],
@@ -267,7 +279,7 @@ pub fn proxy_pins(
     area.chunks_exact(k + 1).map(most).collect()
 }
 
-/// What a member says before it has learnt anything: what a person pinned, else what was discovered.
+/// Returns the vote of a shape in the first round: pinned classes, elsewhere the discovered labels.
 fn first_vote(member: &FitShape<'_>, k: usize) -> Vec<u8> {
     let mut vote = match (member.discovered, member.pinned) {
         ([], []) => return Vec::new(),
@@ -283,7 +295,8 @@ fn first_vote(member: &FitShape<'_>, k: usize) -> Vec<u8> {
     vote
 }
 
-/// The certain statistics with the confident faces of what was carried, all of them together of a given weight.
+/// Adds the confident faces of the representatives to the certain statistics, at a given weight of
+/// all of them together.
 fn with_confident(
     certain: &Statistics,
     members: &[FitShape<'_>],
@@ -315,7 +328,8 @@ fn with_confident(
     all
 }
 
-/// What was discovered of a shape before a person labelled anything, as a vote through the map to itself.
+/// The labels discovered on a shape before a person labelled anything, as a vote through the map of
+/// the shape to itself.
 struct OwnVote {
     probabilities: Vec<u8>,
     p2p: Vec<u32>,
@@ -337,17 +351,17 @@ impl OwnVote {
     }
 }
 
-/// Part of each face `(m,)` of a shape that is to be labelled in `k` classes.
+/// Returns the part of each face `(m,)` of a shape that is labelled in `k` classes.
 fn parts_for(shape: &DescriptionView<'_>, prepared: &Prepared, k: usize) -> Vec<u32> {
     let (surface, features) = (&prepared.surface, &prepared.features);
     let n = N_PARTS_A_CLASS * k + N_PARTS_MORE;
     parts(surface, shape.patches, &features.data, features.dim, n)
 }
 
-/// What is known of the labels of one shape.
+/// The evidence for the labels of one shape.
 struct Evidence<'a> {
     classifier: &'a Classifier,
-    /// Through maps from other shapes.
+    /// Votes through maps from other shapes.
     votes: &'a [Vote<'a>],
     own: Option<&'a OwnVote>,
     /// Part of each face `(m,)`.
@@ -372,7 +386,7 @@ fn labelled(
         trust: 1.0,
     }));
     let (voted, mut weights) = vote_probabilities(shape, &votes, k);
-    // Those of the other shapes among themselves.
+    // The weights of the other shapes only, which must sum to 1.
     weights.truncate(evidence.votes.len());
     let sum: f64 = weights.iter().sum();
     weights.iter_mut().for_each(|w| *w /= sum.max(1e-300));
@@ -394,7 +408,8 @@ fn labelled(
     Labelling::new(classes, &posterior, weights, k)
 }
 
-/// What each class of each face costs `(m, k)`, this share of it the mean over the part `(m,)` that the face is in.
+/// Mixes the cost of each class for each face `(m, k)` with its mean over the face's part; `share`
+/// is the share of the mean, `part_of (m,)` the part of each face.
 fn shared_by_parts(
     mut unary: Vec<f64>,
     surface: &Surface,

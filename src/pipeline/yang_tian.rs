@@ -1,10 +1,11 @@
-//! The source paper taken literally: the yardstick that everything else here is measured against.
+//! The method of the source paper, as published: the baseline for all other methods here.
 //!
-//! Yang and Tian, *Unsupervised Co-segmentation of 3D Shapes via Functional Maps*: the mesh Laplacian of eq. (6)
-//! and 50 of its eigenfunctions; every shape is divided on its own, by k-means in its global point signatures, into
-//! as many parts as there are labels; maps are the least-squares solution for 100 heat kernel signatures; parts that
-//! correspond through the map from a reference get the reference's label. The paper leaves open which shape that is:
-//! here the one whose maps to all others leave the least residual.
+//! Yang and Tian, *Unsupervised Co-segmentation of 3D Shapes via Functional Maps*. The basis is 50
+//! eigenfunctions of the mesh Laplacian of eq. (6). Every shape is divided on its own, by k-means
+//! on its global point signatures, into as many parts as there are labels. Maps are the
+//! least-squares solution for 100 heat kernel signatures. Parts take the label of the corresponding
+//! part of a reference shape. The paper leaves the choice of the reference open; here it is the
+//! shape whose maps to all others have the least residual.
 
 use super::spectrum_of;
 use super::{DescribeError, DescriptionView, N_HKS_TIMES, Params};
@@ -16,14 +17,15 @@ use crate::operators::Operator;
 use nalgebra::DMatrix;
 use rayon::prelude::{IntoParallelRefIterator, ParallelIterator};
 
-/// Eigenfunctions of the basis.
+/// Number of eigenfunctions in the basis.
 const N_EIGENFUNCTIONS: u32 = 50;
-/// Starts of each k-means.
+/// Number of starts of each k-means.
 const N_STARTS: usize = 10;
-/// Singular values below this share of the greatest count as zero: signatures at 100 times are nearly dependent.
+/// Singular values below this share of the greatest one count as zero, because signatures at 100
+/// times are nearly dependent.
 const RANK_TOLERANCE: f64 = 1e-9;
 
-/// A shape divided on its own, in its spectral basis.
+/// A shape divided into parts in its spectral basis.
 struct Divided {
     /// `(n, k)`, `ΦᵀAΦ = I`.
     basis: DMatrix<f64>,
@@ -70,19 +72,19 @@ impl Divided {
         })
     }
 
-    /// `c_12` from this shape to another.
+    /// Returns the functional map `c_12` from this shape to another.
     fn map_to(&self, other: &Self) -> DMatrix<f64> {
         &other.coefficients * &self.inverse
     }
 
-    /// What `c_12` leaves of the other's signatures, relative to them.
+    /// Returns the residual of the other's signatures under `c_12`, relative to their norm.
     fn residual(&self, other: &Self) -> f64 {
         let left = self.map_to(other) * &self.coefficients - &other.coefficients;
         left.norm() / other.coefficients.norm().max(1e-300)
     }
 
-    /// The part of this shape that corresponds to each part of another, one to one, by what the indicators of this
-    /// shape's parts have become there.
+    /// Returns, for each part of another shape, the corresponding part of this one, one to one, by
+    /// the mapped indicators of this shape's parts.
     fn corresponding(&self, other: &Self, k: usize) -> Vec<u32> {
         let mut mine = DMatrix::zeros(self.mass.len(), k);
         for (v, p) in self.parts.iter().enumerate() {
@@ -100,8 +102,8 @@ impl Divided {
     }
 }
 
-/// Label below `k` of each proxy face of each shape. Deterministic for a given seed. All pairs of shapes are mapped, with
-/// matrices of 50 rows.
+/// Returns a label below `k` for each proxy face of each shape. Deterministic for a given seed.
+/// Maps all pairs of shapes, with matrices of 50 rows.
 ///
 /// # Errors
 /// A shape has no mesh Laplacian, or its spectrum cannot be proved complete.

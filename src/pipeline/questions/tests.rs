@@ -1,6 +1,6 @@
 use super::*;
 
-/// Two descriptors that are as they are after standardising.
+/// A normalisation that does not change its two descriptors.
 fn normalisation() -> Normalisation {
     Normalisation {
         mean: vec![0.0; 2],
@@ -9,7 +9,7 @@ fn normalisation() -> Normalisation {
     }
 }
 
-/// A shape whose parts are one patch each, or two if a part is given two places.
+/// Builds a shape whose parts have one patch each, or a patch for each of the given means.
 fn shape(parts: &[(f64, &[[f32; 2]])]) -> ShapeParts {
     let mut out = ShapeParts {
         part_of_face: Vec::new(),
@@ -28,7 +28,7 @@ fn shape(parts: &[(f64, &[[f32; 2]])]) -> ShapeParts {
     out
 }
 
-/// Discovered labels around these places, of equal area and little scatter.
+/// Statistics of discovered labels around these means, with equal areas and little scatter.
 fn discovered(places: &[[f32; 2]]) -> Statistics {
     let offsets = [[0.2, 0.0], [-0.2, 0.0], [0.0, 0.2], [0.0, -0.2]];
     let data: Vec<f32> = places
@@ -45,7 +45,7 @@ const LEG: [f32; 2] = [-1.0, 0.0];
 const SEAT: [f32; 2] = [1.0, 0.0];
 const ARM: [f32; 2] = [0.0, 1.5];
 
-/// Three chairs with legs and a seat; the last has a part of its own kind too.
+/// Three chairs with legs and a seat; the last also has an arm.
 fn chairs() -> Vec<ShapeParts> {
     let legs: [[f32; 2]; 3] = [[-1.0, 0.0], [-1.05, 0.02], [-0.95, -0.02]];
     legs.iter()
@@ -60,7 +60,7 @@ fn chairs() -> Vec<ShapeParts> {
         .collect()
 }
 
-/// The question after these answers: shape, part, class.
+/// Returns the next question after these answers, each with shape, part and class.
 fn question_after(
     shapes: &[ShapeParts],
     answers: &[(usize, u32, usize)],
