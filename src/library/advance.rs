@@ -1,4 +1,4 @@
-//! A collection is brought towards the labels that follow from it, one committed step at a time.
+//! Recomputes outdated labels and models of a collection, one committed step at a time.
 
 use super::change::{Change, commit};
 use super::collection::state::Phase;
@@ -8,16 +8,16 @@ use super::facade::Library;
 use crate::store::Store;
 use rayon::prelude::*;
 
-/// Stale shapes that [`Library::relabel_batch`] relabels at most: enough for all processors and for
-/// one sync to matter little, and less than a second of work on two.
+/// Maximum number of stale shapes that [`Library::relabel_batch`] relabels. It is enough for all
+/// processors and for one sync to matter little, and takes less than a second on two processors.
 pub const MAX_BATCH: usize = 16;
-/// Polygons of all shapes of a batch, of which each is read and cleaned in memory to refine its
-/// boundaries; a larger shape is a batch of its own.
+/// Maximum number of polygons of all shapes of a batch. Each of them is read and cleaned in memory
+/// to refine its boundaries. A larger shape is a batch of its own.
 const MAX_BATCH_POLYGONS: u64 = 500_000;
 
 impl Library {
-    /// Recomputes the labels of one stale shape of the collection, or of any if `None`; false: none
-    /// was stale.
+    /// Recomputes the labels of one stale shape of the collection, or of any collection if `None`.
+    /// Returns false if no shape was stale.
     ///
     /// # Errors
     /// There is no such collection, or the store fails.
@@ -26,12 +26,13 @@ impl Library {
     }
 
     /// Recomputes the labels of up to `most` stale shapes of the collection, or of one that has any
-    /// if `None`, side by side, and commits them together; how many, where a step of fitting the
-    /// model counts as one. 0: no shape was stale. The labels do not depend on `most`.
+    /// if `None`, in parallel, and commits them together. Returns their number, where a step of
+    /// fitting the model counts as one; 0 if no shape was stale. The labels do not depend on
+    /// `most`.
     ///
     /// # Errors
     /// There is no such collection, or the store fails. A shape that cannot be relabelled is an
-    /// error once it is the first of those that are stale.
+    /// error once it is the first of the stale shapes.
     pub fn relabel_batch(&self, collection: Option<&str>, most: usize) -> Result<usize> {
         let wanted = collection.map(|name| self.collection_row(name));
         let wanted = wanted.transpose()?;
@@ -61,7 +62,7 @@ impl Library {
         })
     }
 
-    /// The indices of up to `most` stale shapes, from the one at `first` on.
+    /// Returns the indices of up to `most` stale shapes, beginning with the one at `first`.
     fn batch(&self, collection: &Collection, first: usize, most: usize) -> Result<Vec<usize>> {
         let shapes = collection.shapes();
         let others = (first + 1..shapes.len()).filter(|at| shapes[*at].stale);
@@ -79,9 +80,9 @@ impl Library {
     }
 }
 
-/// Relabels stale shapes side by side and commits them together, in this order; how many.
-/// They are independent of each other: only shapes vote that are not stale, or with the labels that
-/// a person gave them.
+/// Relabels stale shapes in parallel, commits them together in this order, and returns their
+/// number. They are independent of each other, because only shapes vote that are not stale, or that
+/// have labels from a person.
 fn relabel(store: &Store, collection: &mut Collection, batch: &[usize]) -> Result<usize> {
     let is_supervised = collection.state().regime.supervision().is_some();
     let relabelled = batch.par_iter().map(|at| match is_supervised {
@@ -98,7 +99,7 @@ fn relabel(store: &Store, collection: &mut Collection, batch: &[usize]) -> Resul
             }
             Ok(None) => {}
             Err(error) if at == 0 => return Err(error),
-            // Those before it are labelled; the next batch begins with it.
+            // The shapes before it are labelled; the next batch begins with it.
             Err(_) => break,
         }
     }
@@ -108,7 +109,7 @@ fn relabel(store: &Store, collection: &mut Collection, batch: &[usize]) -> Resul
     Ok(n)
 }
 
-/// Relabels those of some shapes that are stale, while labels are discovered; how many.
+/// Relabels those of some shapes that are stale, while labels are discovered. Returns their number.
 pub(super) fn relabel_all(store: &Store, collection: &mut Collection, at: &[usize]) -> Result<u32> {
     let mut n = 0;
     for at in at {
@@ -118,7 +119,7 @@ pub(super) fn relabel_all(store: &Store, collection: &mut Collection, at: &[usiz
     Ok(n)
 }
 
-/// Fits the model to the training shapes, if it is not.
+/// Fits the model to the training shapes, if it is out of date.
 pub(super) fn fit_model(store: &Store, collection: &mut Collection) -> Result<()> {
     let is_fitted = |c: &Collection| match c.state().regime.supervision() {
         Some(supervision) => supervision.phase() == Phase::Fitted,

@@ -1,4 +1,4 @@
-//! Stored maps that do not agree with the others are recomputed, through the latent functions on which
+//! Recomputes stored maps that do not agree with the others, through the latent functions on which
 //! the others agree.
 
 use super::change::{Change, commit, map_row};
@@ -15,22 +15,23 @@ use crate::fmap::latent::LatentBasis;
 use crate::store::agreement::KeptMaps;
 use crate::store::{CollectionRow, ShapeId, Store};
 
-/// Shapes on which the latent functions are solved for together; the others join one by one.
+/// Maximum number of shapes for which the latent functions are solved together; the others are
+/// added one by one.
 const MAX_TOGETHER: usize = 40;
 
 /// A stored map that does not agree with the maps through other shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Disagreement {
-    /// Functions are carried from this shape
+    /// The shape from which the map carries functions.
     pub from: ShapeId,
-    /// to this one.
+    /// The shape to which it carries them.
     pub to: ShapeId,
-    /// How it stands among the others.
+    /// How the map agrees with the others.
     pub standing: Standing,
 }
 
 impl Library {
-    /// The stored maps of a collection that do not agree with the others.
+    /// Returns the stored maps of a collection that do not agree with the others.
     ///
     /// # Errors
     /// There is no such collection, or the catalog cannot be read.
@@ -40,10 +41,11 @@ impl Library {
         Ok(disagreements(&kept, &kept.standings()))
     }
 
-    /// Recomputes the stored maps of a collection that do not agree with the others: through the latent
-    /// functions of the others, then refined, and from nearest neighbours of descriptors, as at first.
-    /// The one that fits the others better is stored, unless the stored map fits better still. The
-    /// shapes they lead to become stale. Returns what was done, in words.
+    /// Recomputes the stored maps of a collection that do not agree with the others: once through
+    /// the latent functions of the others, then refined, and once from nearest neighbours of
+    /// descriptors, like a new map. Stores the one that agrees better with the others, unless the
+    /// stored map agrees better still. The shapes to which the maps lead become stale. Returns a
+    /// line of text for each map.
     ///
     /// # Errors
     /// There is no such collection, or it cannot be read or written.
@@ -52,8 +54,8 @@ impl Library {
         self.with_collection(row, |collection| self.mend_in(collection))
     }
 
-    /// How a map for parts agrees with the stored ones of its collection; `None` if it is too small to
-    /// compare.
+    /// Returns how a map for parts agrees with the stored ones of its collection; `None` if it is
+    /// too small to compare.
     ///
     /// # Errors
     /// There is no such collection or shape, or the catalog cannot be read.
@@ -118,7 +120,7 @@ impl Library {
             };
             commit(&self.store, collection, change, |_, _| Ok(()))?;
             done.push(format!(
-                "map {names}: made anew, departure {before:.2} to {after:.2}, \
+                "map {names}: recomputed, departure {before:.2} to {after:.2}, \
                  confidence {was:.2} to {:.2}",
                 new.quality.confidence
             ));
@@ -126,8 +128,8 @@ impl Library {
         Ok(done)
     }
 
-    /// The latent functions on which maps that agree do so, and where each shape is among them, if
-    /// it is.
+    /// Computes the latent functions of the maps that agree, and the position of each shape among
+    /// them, if it has one.
     fn latent(
         &self,
         kept: &KeptMaps,
@@ -178,8 +180,8 @@ impl Library {
     }
 }
 
-/// Counts the maps to a new shape that do not agree with the maps between the shapes they come from,
-/// and logs them. Their votes count as their confidence says.
+/// Counts the maps to a new shape that do not agree with the maps between the shapes they come
+/// from, and logs them. Their votes keep the weight of their confidence.
 pub(super) fn n_inconsistent(store: &Store, maps: &[(ShapeId, FunctionalMap)]) -> Result<u32> {
     let sources = maps.iter().map(|(from, _)| *from).collect();
     let catalog = store.catalog();
@@ -203,8 +205,8 @@ pub(super) fn n_inconsistent(store: &Store, maps: &[(ShapeId, FunctionalMap)]) -
     Ok(n)
 }
 
-/// Of some maps from the shape `i` to the shape `j` the one that departs least from the maps that
-/// agree, and by how much.
+/// Returns the map from the shape `i` to the shape `j` that departs least from the maps that agree,
+/// and by how much it departs.
 fn best_fitting(
     stored: &KeptMaps,
     standings: &[Standing],

@@ -1,5 +1,5 @@
-//! A collection before a change by a person: what undoing the change needs, as the catalog stores
-//! it.
+//! The state of a collection before a change by a person, as the catalog stores it to undo the
+//! change.
 
 use super::collection::{Collection, ModelState, State, StoredState};
 use super::error::Result;
@@ -14,10 +14,10 @@ pub(super) struct Before {
     labels: Vec<StoredLabel>,
     /// `None`: the change concerns names only.
     pub(super) rest: Option<Rest>,
-    /// Which way was up, if the change concerns that.
+    /// The up axis, if the change concerns it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) up: Option<String>,
-    /// The bytes of the model; none if there was no model.
+    /// The bytes of the model; empty without a model.
     #[serde(skip)]
     model: Vec<u8>,
 }
@@ -34,13 +34,13 @@ struct StoredLabel {
 pub(super) struct Rest {
     state: StoredState,
     epoch: u64,
-    /// Shapes of this ordinal and above came later.
+    /// Shapes with this ordinal and above were added later.
     pub(super) next_ordinal: u64,
-    /// Shapes whose labels waited to be recomputed.
+    /// Shapes that were stale.
     pub(super) stale: Vec<i64>,
     /// Pinned faces of the shapes that the change touches.
     pub(super) pins: Vec<(i64, Option<Vec<i32>>)>,
-    /// Verdicts on the shapes that the change touches.
+    /// Verdicts on the shapes that the change concerns.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) reviews: Vec<(i64, Option<StoredReview>)>,
 }
@@ -53,7 +53,7 @@ pub(super) struct StoredReview {
 }
 
 impl Before {
-    /// The labels before one gets a name.
+    /// The labels, before a change of a name.
     pub(super) fn names(labels: Vec<LabelRow>) -> Self {
         Self {
             labels: labels.into_iter().map(StoredLabel::from).collect(),
@@ -63,7 +63,7 @@ impl Before {
         }
     }
 
-    /// A collection before another way is up.
+    /// The state before a change of the up axis.
     pub(super) fn up(reader: &Reader<'_>, collection: &Collection) -> Result<Self> {
         Ok(Self {
             up: Some(collection.row().up.clone()),
@@ -71,7 +71,7 @@ impl Before {
         })
     }
 
-    /// A collection before a change that touches the pinned faces or the verdicts of `shapes`.
+    /// The state before a change of the pinned faces or the verdicts of `shapes`.
     pub(super) fn labels(
         reader: &Reader<'_>,
         collection: &Collection,
@@ -98,7 +98,7 @@ impl Before {
         })
     }
 
-    /// The bytes: length of the text (u32), the text, the model.
+    /// Encodes the state: length of the text (u32), the text, the model.
     pub(super) fn encode(&self) -> Vec<u8> {
         let text = to_json(self);
         let n = u32::try_from(text.len()).expect("invariant: the state is less than 4 GiB");
@@ -119,13 +119,13 @@ impl Before {
         })
     }
 
-    /// The row of a label as it was; `None`: it did not exist.
+    /// Returns the row of a label; `None` if the label did not exist.
     pub(super) fn label(&self, id: LabelId) -> Option<LabelRow> {
         let found = self.labels.iter().find(|l| l.id == id);
         found.cloned().map(LabelRow::from)
     }
 
-    /// The model as it was; `None`: there was none.
+    /// Returns the model; `None` if there was none.
     pub(super) fn model(&self) -> Result<Option<ModelState>> {
         if self.model.is_empty() {
             return Ok(None);
@@ -136,7 +136,7 @@ impl Before {
 }
 
 impl Rest {
-    /// The state as it was.
+    /// Returns the state.
     pub(super) fn state(&self) -> State {
         self.state.clone().into()
     }

@@ -1,60 +1,67 @@
-//! The one way in which a collection changes: everything that becomes true together is a
-//! [`Change`], and [`commit`] writes it in one transaction, with what undoing it needs, and then
-//! brings the collection in memory up to it.
+//! Changes a collection; there is no other way. A [`Change`] is everything that becomes true
+//! together. [`commit`] writes it in one transaction, together with the data that undoing it needs,
+//! and then applies it to the collection in memory.
+
+mod edits;
+mod log;
+mod undoable;
+
+pub(super) use edits::LabelEdit;
+pub(super) use log::event;
+pub(super) use undoable::Undoable;
 
 use super::before::Before;
 use super::collection::{
     Applied, Collection, KnownShape, ModelState, Propagation, Staleness, State,
 };
 use super::error::{LibraryError, Result};
+use super::event::EventKind;
 use super::labelling::{NewLabels, Relabelled, cause};
 use super::once::{Request, once, unix_secs};
 use super::reason::Reason;
-use super::rows::{damaged, label_colour, quality_to_json, to_json};
-use super::types::{EventKind, LabelId};
+use super::rows::{damaged, quality_to_json};
 use crate::fmap::FunctionalMap;
-use crate::pipeline::LabelChange;
-use crate::store::catalog::KIND_NAME;
 use crate::store::{
-    CollectionId, CollectionRow, ItemStatus, JobItemRow, LabelRow, MapRow, NewShapeRow, ObjectRow,
-    ReviewRow, ShapeId, Store, Tx,
+    CollectionId, CollectionRow, ItemStatus, JobItemRow, MapRow, NewShapeRow, ObjectRow, ReviewRow,
+    ShapeId, Store, Tx,
 };
 use std::collections::BTreeSet;
 
-/// What becomes true together. Fields are written, and their events logged, in this order.
+/// Everything that becomes true together. Fields are written, and their events logged, in this
+/// order.
 #[derive(Debug, Default)]
 pub(super) struct Change {
-    /// The queued item that the change settles; if it is over by now, nothing changes.
+    /// The queued item that the change settles. If it is no longer queued, nothing changes.
     pub(super) accepted: Option<JobItemRow>,
-    /// The change is one by a person, which can be undone.
+    /// The change by a person that this is, if it can be undone.
     pub(super) undoable: Option<Undoable>,
-    /// A shape that goes, and its name.
+    /// A shape that is removed, and its name.
     pub(super) removed: Option<(ShapeId, String)>,
-    /// Which way is up from now on.
+    /// The new up axis.
     pub(super) up: Option<String>,
-    /// The event that comes before those of labels.
+    /// The event before those of labels.
     pub(super) opening: Option<EventKind>,
-    /// What happens to labels of the collection.
+    /// Edits of labels of the collection.
     pub(super) labels: Vec<LabelEdit>,
     /// New pins of shapes; `None`: no face is pinned.
     pub(super) pins: Vec<(ShapeId, Option<Vec<i32>>)>,
-    /// New verdicts on shapes; `None`: nobody gave one.
+    /// New verdicts on shapes; `None`: no verdict.
     pub(super) reviews: Vec<(ShapeId, Option<ReviewRow>)>,
-    /// A shape that comes.
+    /// A shape that is added.
     pub(super) added: Option<Box<Addition>>,
     /// Maps between stored shapes.
     pub(super) maps: Vec<MapRow>,
-    /// The event that comes between those of labels and those of stored shapes.
+    /// The event between those of labels and those of stored shapes.
     pub(super) closing: Option<EventKind>,
     /// Stored shapes with new labels.
     pub(super) relabelled: Vec<Relabelled>,
-    /// Which shapes are stale then.
+    /// Which shapes are stale afterwards.
     pub(super) staleness: Staleness,
-    /// Shapes that are stale or not in spite of `staleness`.
+    /// Shapes that are stale, or not, in spite of `staleness`.
     pub(super) stale: Vec<(ShapeId, bool)>,
-    /// Another model.
+    /// The new model.
     pub(super) model: Option<ModelState>,
-    /// Another state.
+    /// The new state.
     pub(super) state: Option<State>,
     /// Whether a job propagates the change to the stale shapes.
     pub(super) propagates: bool,
@@ -62,40 +69,12 @@ pub(super) struct Change {
     pub(super) undone: Option<i64>,
 }
 
-/// A change by a person.
-#[derive(Debug)]
-pub(super) enum Undoable {
-    Correct { shape: String },
-    Answer { shape: String },
-    Approve { shape: String },
-    Doubt { shape: String },
-    Name,
-    Merge { label: LabelId, into: LabelId },
-    Split { label: LabelId, new: LabelId },
-    Up { from: String, to: String },
-}
-
-/// Something that happens to a label of the collection.
-#[derive(Debug)]
-pub(super) enum LabelEdit {
-    /// A label is created, merged or split.
-    Changed(LabelChange),
-    /// A person uses the label; it is created if it is not there.
-    Used(LabelId),
-    /// The label is used no more.
-    Retired(LabelId),
-    /// The label gets a name.
-    Named(LabelRow, String),
-    /// The label is as it was before.
-    Restored(LabelRow),
-}
-
-/// A new shape with everything that is stored of it.
+/// A new shape with everything that is stored about it.
 #[derive(Debug)]
 pub(super) struct Addition {
     object: ObjectRow,
     shape: NewShapeRow,
-    /// Its labels, in their version.
+    /// Its labels, with their version.
     labels: NewLabels,
     /// Maps from stored shapes to it.
     maps: Vec<(ShapeId, FunctionalMap)>,
@@ -104,13 +83,13 @@ pub(super) struct Addition {
 /// A change that is written but not committed yet.
 #[derive(Debug)]
 pub(super) struct Written {
-    /// The collection's row after it.
+    /// The collection's new row.
     pub(super) row: CollectionRow,
-    /// The job that propagates it; 0: none does.
+    /// The job that propagates it; 0 without one.
     pub(super) job: u64,
     /// The new shape.
     added: Option<ShapeId>,
-    /// The state in `row`, if it is another one than before.
+    /// The new state in `row`; `None` if it did not change.
     state: Option<State>,
 }
 
@@ -123,43 +102,8 @@ impl Change {
     }
 }
 
-impl From<LabelChange> for LabelEdit {
-    fn from(change: LabelChange) -> Self {
-        Self::Changed(change)
-    }
-}
-
-impl Undoable {
-    pub(super) fn kind(&self) -> &'static str {
-        match self {
-            Self::Correct { .. } => "correct",
-            Self::Answer { .. } => "answer",
-            Self::Approve { .. } => "approve",
-            Self::Doubt { .. } => "doubt",
-            Self::Name => KIND_NAME,
-            Self::Merge { .. } => "merge",
-            Self::Split { .. } => "split",
-            Self::Up { .. } => "up",
-        }
-    }
-
-    fn detail(&self) -> String {
-        let detail = match self {
-            Self::Correct { shape }
-            | Self::Answer { shape }
-            | Self::Approve { shape }
-            | Self::Doubt { shape } => serde_json::json!({ "shape": shape }),
-            Self::Name => serde_json::json!({}),
-            Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
-            Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
-            Self::Up { from, to } => serde_json::json!({ "from": from, "to": to }),
-        };
-        to_json(&detail)
-    }
-}
-
-/// Writes a change in one transaction together with what `finish` writes, and brings the collection
-/// up to it.
+/// Writes a change in one transaction together with the rows that `finish` writes, and then applies
+/// it to the collection.
 ///
 /// # Errors
 /// The store fails, or the collection was deleted meanwhile; then nothing is written.
@@ -178,8 +122,8 @@ pub(super) fn commit<T>(
     Ok(value)
 }
 
-/// [`commit`] of a request that takes effect once: `finish` makes its reply, which is returned, or
-/// the reply that was given before.
+/// Commits the change of a request that takes effect once. Returns the reply that `finish` makes,
+/// or the stored reply of an earlier repeat.
 pub(super) fn commit_once(
     store: &Store,
     collection: &mut Collection,
@@ -262,14 +206,14 @@ impl Change {
         self.write_model(tx, collection)?;
         let job = self.write_state(tx, collection)?;
         if let Some(undone) = self.undone {
-            // Only now: the labels above must not be noted with an older change.
+            // Last, because the labels above must not be recorded with an older change.
             tx.delete_correction(undone)?;
         }
         let row = tx.collection_by_id(id)?;
         let row = row.ok_or_else(|| LibraryError::deleted(&collection.row().name))?;
         let state = match row.state == collection.row().state {
             true => None,
-            // As it would be read: numbers may lose their last bit on the way through text.
+            // Decoded from the row, because numbers may lose their last bit in text.
             false => Some(State::of(&row)?),
         };
         Ok(Written {
@@ -306,8 +250,8 @@ impl Change {
         Ok(())
     }
 
-    /// Writes the model, which from then on is what would be read: half of each symmetric matrix is
-    /// stored, and the other half may differ from it in its last bits.
+    /// Writes the model, and replaces it by the decoded one: only half of each symmetric matrix is
+    /// stored, and the other half may differ in its last bits.
     fn write_model(&mut self, tx: &Tx<'_>, collection: &Collection) -> Result<()> {
         let Some(model) = &self.model else {
             return Ok(());
@@ -320,7 +264,7 @@ impl Change {
         Ok(())
     }
 
-    /// Writes the state, and the job that propagates the change; 0: none does.
+    /// Writes the state, and the job that propagates the change. Returns the job; 0 without one.
     fn write_state(&mut self, tx: &Tx<'_>, collection: &Collection) -> Result<u64> {
         let id = collection.id();
         let mut job = 0;
@@ -336,7 +280,7 @@ impl Change {
         Ok(job)
     }
 
-    /// The change as the collection in memory shows it.
+    /// Returns the effect of the change on the collection in memory.
     fn applied(self, written: Written) -> Applied {
         let added = self
             .added
@@ -398,33 +342,6 @@ impl Addition {
     }
 }
 
-impl LabelEdit {
-    fn write(&self, tx: &Tx<'_>, collection: CollectionId) -> Result<()> {
-        match self {
-            Self::Changed(change) => label_change(tx, collection, change),
-            Self::Used(id) => use_label(tx, collection, *id),
-            Self::Retired(label) => {
-                event(tx, collection, &EventKind::LabelRetired { label: *label })?;
-                Ok(())
-            }
-            Self::Named(row, name) => {
-                let named = LabelRow {
-                    name: Some(name.clone()),
-                    ..row.clone()
-                };
-                tx.put_label(collection, &named)?;
-                let named = EventKind::LabelNamed {
-                    label: row.id,
-                    name: name.clone(),
-                };
-                event(tx, collection, &named)?;
-                Ok(())
-            }
-            Self::Restored(row) => Ok(tx.put_label(collection, row)?),
-        }
-    }
-}
-
 /// Refuses an item that was cancelled while it was placed, so that it is either cancelled or
 /// placed.
 fn still_queued(tx: &Tx<'_>, accepted: &JobItemRow) -> Result<()> {
@@ -437,28 +354,7 @@ fn still_queued(tx: &Tx<'_>, accepted: &JobItemRow) -> Result<()> {
     Err(LibraryError::FailedPrecondition { reason, message })
 }
 
-/// Appends an event to a collection's log and returns its sequence number.
-pub(super) fn event(tx: &Tx<'_>, collection: CollectionId, kind: &EventKind) -> Result<u64> {
-    let name = match kind {
-        EventKind::CollectionCreated => "collection_created",
-        EventKind::CollectionDeleted => "collection_deleted",
-        EventKind::ShapeAdded { .. } => "shape_added",
-        EventKind::ShapeRemoved { .. } => "shape_removed",
-        EventKind::LabelsChanged { .. } => "labels_changed",
-        EventKind::LabelCreated { .. } => "label_created",
-        EventKind::LabelMerged { .. } => "label_merged",
-        EventKind::LabelSplit { .. } => "label_split",
-        EventKind::LabelNamed { .. } => "label_named",
-        EventKind::LabelRetired { .. } => "label_retired",
-        EventKind::Corrected { .. } => "corrected",
-        EventKind::Undone { .. } => "undone",
-        EventKind::UpChanged { .. } => "up_changed",
-        EventKind::Reclustered { .. } => "reclustered",
-    };
-    Ok(tx.append_event(collection, name, &to_json(kind))?)
-}
-
-/// Writes new labels of a stored shape and the event that tells which faces changed.
+/// Writes new labels of a stored shape, and the event with the areas that moved.
 fn put_relabelled(tx: &Tx<'_>, collection: CollectionId, shape: &mut Relabelled) -> Result<()> {
     let labels = &mut shape.labels;
     let changed = EventKind::LabelsChanged {
@@ -471,62 +367,7 @@ fn put_relabelled(tx: &Tx<'_>, collection: CollectionId, shape: &mut Relabelled)
     Ok(tx.put_labels(shape.shape, &labels.row, &labels.summary)?)
 }
 
-fn label_change(tx: &Tx<'_>, collection: CollectionId, change: &LabelChange) -> Result<()> {
-    match *change {
-        LabelChange::Created(id) => {
-            let taken = tx.take_labels(collection, 1)?;
-            assert_eq!(
-                taken, id,
-                "invariant: new labels are numbered as they are created"
-            );
-            tx.put_label(collection, &new_label(id))?;
-            event(tx, collection, &EventKind::LabelCreated { label: id })?;
-        }
-        LabelChange::Merged { from, into } => {
-            if let Some(row) = tx.labels(collection)?.into_iter().find(|l| l.id == from) {
-                let merged = LabelRow {
-                    merged_into: Some(into),
-                    ..row
-                };
-                tx.put_label(collection, &merged)?;
-            }
-            event(tx, collection, &EventKind::LabelMerged { from, into })?;
-        }
-        LabelChange::Split { from, into } => {
-            let into = vec![into];
-            event(tx, collection, &EventKind::LabelSplit { from, into })?;
-        }
-    }
-    Ok(())
-}
-
-/// Brings a label into use that a person named by its id.
-fn use_label(tx: &Tx<'_>, collection: CollectionId, id: LabelId) -> Result<()> {
-    let there = tx.labels(collection)?.into_iter().find(|l| l.id == id);
-    let row = match there {
-        // In use again: what it was merged into keeps what it has.
-        Some(row) => LabelRow {
-            merged_into: None,
-            ..row
-        },
-        None => new_label(id),
-    };
-    tx.reserve_label(collection, id)?;
-    tx.put_label(collection, &row)?;
-    event(tx, collection, &EventKind::LabelCreated { label: id })?;
-    Ok(())
-}
-
-fn new_label(id: LabelId) -> LabelRow {
-    LabelRow {
-        id,
-        name: None,
-        colour: label_colour(id),
-        merged_into: None,
-    }
-}
-
-/// The row of a map.
+/// Returns the row of a map.
 pub(super) fn map_row(from: ShapeId, to: ShapeId, map: &FunctionalMap) -> MapRow {
     MapRow {
         from,

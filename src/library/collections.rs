@@ -1,8 +1,9 @@
-//! Collections are created, described and deleted, and their labels are named.
+//! Creates, lists and deletes collections, and names their labels.
 
 use super::change::{Change, LabelEdit, Undoable, commit_once, event};
 use super::collection::State;
 use super::error::{LibraryError, Named, Result};
+use super::event::EventKind;
 use super::facade::Library;
 use super::lookup::require_collection;
 use super::names::check_name;
@@ -11,22 +12,22 @@ use super::reason::Reason;
 use super::rows::{damaged, operator_from_name, operator_name, to_json};
 use super::sources::Sources;
 use super::types::{
-    CollectionInfo, CollectionSpec, EventKind, LabelId, LabelInfo, RequestKey, Up, UpEstimate,
+    CollectionInfo, CollectionSpec, LabelId, LabelInfo, RequestKey, Up, UpEstimate,
 };
 use crate::pipeline::Params;
 use crate::store::{CollectionId, CollectionRow, LabelRow, NewCollection, Reader, Tx};
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
-/// Most kinds of parts that a collection can be told to have.
+/// Maximum number of part kinds of a collection.
 pub const MAX_PARTS: u32 = 64;
 const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
 
 impl Library {
-    /// Creates a collection. The same key gives the same collection again.
+    /// Creates a collection. A repeated request with the same key returns the same collection.
     ///
     /// # Errors
-    /// A name or number out of range, or a name that is taken.
+    /// A name or number is out of range, or the name is taken.
     pub fn create_collection(
         &self,
         spec: &CollectionSpec,
@@ -71,7 +72,7 @@ impl Library {
         self.collection(&spec.name)
     }
 
-    /// All collections by name.
+    /// Returns all collections by name.
     ///
     /// # Errors
     /// The catalog cannot be read.
@@ -81,10 +82,10 @@ impl Library {
             .read(|r| r.collections()?.into_iter().map(|c| info(r, c)).collect())
     }
 
-    /// One collection.
+    /// Returns one collection.
     ///
     /// # Errors
-    /// There is none of the name.
+    /// There is no collection of this name.
     pub fn collection(&self, name: &str) -> Result<CollectionInfo> {
         let row = self.collection_row(name)?;
         self.store.catalog().read(|r| info(r, row))
@@ -93,10 +94,11 @@ impl Library {
     /// Deletes a collection with all its shapes.
     ///
     /// # Errors
-    /// There is none of the name.
+    /// There is no collection of this name.
     pub fn delete_collection(&self, name: &str, key: Option<&RequestKey>) -> Result<()> {
         let request = Request::of(key, &format!("delete {name:?}"));
-        // Stays empty where the request is repeated: another collection may have the name by then.
+        // Stays empty if the request is repeated, because another collection may have the name by
+        // then.
         let deleted = std::cell::Cell::new(None);
         let delete = |tx: &Tx<'_>| {
             let row = require_collection(tx, name)?;
@@ -114,7 +116,7 @@ impl Library {
         Ok(())
     }
 
-    /// Gives a label a name.
+    /// Names a label.
     ///
     /// # Errors
     /// There is no such collection or label, or the name is out of range.
@@ -148,7 +150,7 @@ impl Library {
     }
 }
 
-/// What giving a label a name changes.
+/// Returns the change that names a label.
 fn naming(labels: Vec<LabelRow>, label: LabelId, name: &str) -> Result<Change> {
     let row = find_label(&labels, label)?.clone();
     let taken =
@@ -166,7 +168,7 @@ fn naming(labels: Vec<LabelRow>, label: LabelId, name: &str) -> Result<Change> {
     })
 }
 
-/// A label as a reader sees it.
+/// Reads a label.
 pub(super) fn label_in(
     reader: &Reader<'_>,
     collection: CollectionId,
@@ -178,13 +180,13 @@ pub(super) fn label_in(
     Ok(label_info(find_label(&labels, label)?.clone(), n_shapes))
 }
 
-/// A label among those of a collection, in use or not.
+/// Finds a label among those of a collection, in use or not.
 pub(super) fn find_label(labels: &[LabelRow], label: LabelId) -> Result<&LabelRow> {
     let found = labels.iter().find(|l| l.id == label);
     found.ok_or_else(|| LibraryError::not_found(Named::Label, label.to_string()))
 }
 
-/// A label with the number of shapes that carry it.
+/// A label with the number of shapes that have it.
 fn label_info(row: LabelRow, n_shapes: u64) -> LabelInfo {
     LabelInfo {
         id: row.id,

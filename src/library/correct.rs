@@ -1,10 +1,11 @@
-//! A person labels faces of a shape: they are pinned, and the labels of all other faces follow from
-//! them.
+//! Pins the labels that a person gives to faces of a shape. The labels of all other faces follow
+//! from them.
 
 use super::change::{Change, LabelEdit, Undoable, commit_once};
 use super::collection::state::{Supervision, Vocabulary};
 use super::collection::{Collection, Staleness, supervised};
 use super::error::{LibraryError, Result};
+use super::event::EventKind;
 use super::facade::Library;
 use super::labelling::{NewLabels, Relabelled, area_shares, cause, face_ids};
 use super::once::{Request, answered, from_reply};
@@ -13,7 +14,7 @@ use super::reason::Reason;
 use super::review_rows::{check_reviewer, review_row};
 use super::rows::to_json;
 use super::sources::{Known, Sources};
-use super::types::{EventKind, FailureSubject, LabelId, PartInfo, RequestKey};
+use super::types::{FailureSubject, LabelId, PartInfo, RequestKey};
 use super::verdict::ReviewState;
 use crate::correspondence::parts;
 use crate::pipeline::DescriptionView;
@@ -22,9 +23,9 @@ use crate::store::{Digest, LabelSummary, LabelVersionRow, ShapeId, Store};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
-/// Largest label id that a person can choose.
+/// Largest label id that a person can use.
 pub const MAX_LABEL: u32 = 65_535;
-/// Most labels of a collection that a person can use.
+/// Maximum number of labels of a collection that persons can use.
 pub const MAX_LABELS: usize = 64;
 
 /// Labels that a person gives to faces of a shape.
@@ -51,26 +52,27 @@ pub enum Correction {
 /// What a correction did.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Corrected {
-    /// Version of the shape's labels.
+    /// New version of the shape's labels.
     pub version: u64,
     /// Sequence number of the collection after it.
     pub sequence: u64,
-    /// Faces of the shape that a person labelled, now or before.
+    /// Number of faces of the shape that a person labelled, now or before.
     pub n_faces: u64,
-    /// Share of the shape's area that those cover.
+    /// Share of the shape's area that these faces cover.
     pub area_share: f64,
     /// Share of the shape's area whose label changed.
     pub changed_share: f64,
-    /// Shapes whose labels wait to be recomputed from it.
+    /// Number of shapes whose labels wait to be recomputed from it.
     pub n_stale: u64,
-    /// The job in which it is carried to them; 0 for what an earlier version answered.
+    /// The job that propagates it to these shapes; 0 in a reply that an earlier version stored.
     #[serde(default)]
     pub job: u64,
 }
 
 impl Correction {
-    /// What tells this correction from every other of the same shape. The layout is versioned:
-    /// another one would refuse an honest repeat of a request that was answered before.
+    /// Returns a digest that distinguishes this correction from every other one of the same shape.
+    /// The layout is versioned: a different layout would refuse an honest repeat of a request that
+    /// was answered before.
     fn digest(&self, collection: &str, shape: &str) -> Digest {
         let mut fields = blake3::Hasher::new();
         let mut field = |bytes: &[u8]| {
@@ -99,7 +101,7 @@ impl Correction {
         Digest(*fields.finalize().as_bytes())
     }
 
-    /// The digest that version 0.1.0 stored: of this value as text.
+    /// Returns the digest that version 0.1.0 stored: that of this value as text.
     fn digest_of_first_release(&self, collection: &str, shape: &str) -> Digest {
         let text = match self {
             Self::Whole(labels) => format!("Whole({labels:?})"),
@@ -113,7 +115,7 @@ impl Correction {
 /// A correction before it is written.
 pub(super) struct Corrects {
     pub(super) change: Change,
-    /// Version of the shape's labels then.
+    /// Version of the shape's labels before it.
     version: u64,
     n_faces: u64,
     area_share: f64,
@@ -121,9 +123,9 @@ pub(super) struct Corrects {
 }
 
 impl Library {
-    /// Labels faces of a shape by hand. They keep these labels until a person changes them; those
-    /// of other shapes follow, in the background, from all corrected shapes. Ids that do not exist
-    /// are created.
+    /// Labels faces of a shape by hand. They keep these labels until a person changes them. The
+    /// labels of other shapes follow in the background from all training shapes. Labels with new
+    /// ids are created.
     ///
     /// # Errors
     /// There is no such collection or shape, or a label or a number of labels is out of range.
@@ -137,10 +139,10 @@ impl Library {
         self.correct_by(collection, shape, correction, "", key)
     }
 
-    /// [`Library::correct`] by the person `by`, which the shape's review says.
+    /// Does what [`Library::correct`] does, and records the person `by` in the shape's review.
     ///
     /// # Errors
-    /// As there, or the person's name cannot be one.
+    /// Those of [`Library::correct`]; or the name of the person is not valid.
     pub fn correct_by(
         &self,
         collection: &str,
@@ -170,7 +172,7 @@ impl Library {
 }
 
 impl Corrects {
-    /// Writes the correction; `reply` makes the text that is stored as its reply.
+    /// Writes the correction. `reply` makes the text that is stored as its reply.
     pub(super) fn commit(
         self,
         store: &Store,
@@ -200,7 +202,7 @@ impl Corrects {
     }
 }
 
-/// What a correction of one shape changes.
+/// Returns the change that corrects one shape.
 pub(super) fn corrects(
     collection: &Collection,
     sources: &dyn Sources,
@@ -274,7 +276,7 @@ pub(super) fn corrects(
     })
 }
 
-/// Labels that shapes of a collection may carry before a change.
+/// Returns the labels that shapes of a collection may have before a change.
 fn active_labels(collection: &Collection, used: &UsedLabels) -> BTreeSet<LabelId> {
     let mut labels = used.labels.clone();
     let supervision = collection.state().regime.supervision();
@@ -284,7 +286,7 @@ fn active_labels(collection: &Collection, used: &UsedLabels) -> BTreeSet<LabelId
     labels
 }
 
-/// The label that a correction gives each polygon; -1: none.
+/// Returns the label that a correction gives to each polygon; -1 for none.
 fn polygon_labels(
     known: &Known,
     view: &DescriptionView<'_>,
@@ -359,7 +361,7 @@ fn polygon_labels(
     Ok(given)
 }
 
-/// The newest labels of a shape with those that a person gave in their place.
+/// Returns the newest labels of a shape, overwritten by those that a person gave.
 fn corrected_labels(known: &Known, view: &DescriptionView<'_>, pins: &[i32]) -> NewLabels {
     let mut row = LabelVersionRow {
         proxy_labels: known.labels.proxy_labels.clone(),
@@ -411,7 +413,7 @@ mod tests {
     use super::Correction;
     use crate::store::Digest;
 
-    /// A repeat of a request that an earlier version answered is known by this text.
+    /// This text identifies a repeat of a request that an earlier version answered.
     #[test]
     fn the_first_release_s_digest_is_that_of_the_value_as_text() {
         let part = Correction::Part { part: 3, label: 7 };

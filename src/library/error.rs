@@ -1,4 +1,4 @@
-//! Why an operation on the library failed.
+//! Defines the errors of operations on the library.
 
 use super::likely::{did_you_mean, likeliest};
 use super::reason::{Code, Reason};
@@ -7,21 +7,21 @@ use crate::store::StoreError;
 
 pub(super) type Result<T> = std::result::Result<T, LibraryError>;
 
-/// Why an operation on the library failed.
+/// An error of an operation on the library.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // the messages say it
 pub enum LibraryError {
-    /// Names what is wrong and the limit. `reason` is stable.
+    /// The message names the value and the limit. `reason` is stable.
     #[error("{message}")]
     InvalidArgument { reason: Reason, message: String },
-    /// The same, of one place in the input.
+    /// The same for one location in the input.
     #[error("{message}")]
     InvalidFace {
         reason: Reason,
         message: String,
         subject: FailureSubject,
     },
-    /// `nearest` is what was probably meant.
+    /// `nearest` is the name that was probably meant.
     #[error("no {what} named {name:?}{}", did_you_mean(nearest.as_deref()))]
     NotFound {
         what: Named,
@@ -39,7 +39,7 @@ pub enum LibraryError {
     Store(#[from] StoreError),
 }
 
-/// What a library looks up by name.
+/// A thing that the library looks up by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Named {
@@ -105,7 +105,7 @@ impl From<&LibraryError> for Failure {
 }
 
 impl LibraryError {
-    /// There is nothing of that name.
+    /// Makes the error for a name that does not exist.
     pub(super) fn not_found(what: Named, name: impl Into<String>) -> Self {
         Self::NotFound {
             what,
@@ -114,7 +114,8 @@ impl LibraryError {
         }
     }
 
-    /// There is none of that name among `known`, of which one may have been meant.
+    /// Makes the error for a name that is not among `known`. The error suggests the most similar of
+    /// them.
     pub(super) fn none_of(what: Named, name: &str, known: &[String]) -> Self {
         let nearest = likeliest(name, known.iter().map(String::as_str));
         Self::NotFound {
@@ -124,7 +125,7 @@ impl LibraryError {
         }
     }
 
-    /// The collection was deleted while it was in use.
+    /// Makes the error for a collection that was deleted during its use.
     pub(super) fn deleted(collection: &str) -> Self {
         Self::FailedPrecondition {
             reason: Reason::Gone,

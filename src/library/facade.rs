@@ -1,5 +1,5 @@
-//! An open library: its store, and its collections in memory, each of which one thread uses at a
-//! time.
+//! Opens a library. It holds the store, and the collections in memory, each of which one thread
+//! uses at a time.
 
 use super::collection::Collection;
 use super::error::{LibraryError, Named, Result};
@@ -14,10 +14,10 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A collection in memory; `None`: the next one who uses it loads it.
+/// A collection in memory; `None` until the next user loads it.
 type Slot = Arc<Mutex<Option<Collection>>>;
 
-/// An open library. One process at a time holds it (a lock file says so).
+/// An open library. One process at a time holds it; a lock file ensures that.
 pub struct Library {
     pub(super) store: Store,
     collections: Mutex<HashMap<CollectionId, Slot>>,
@@ -25,15 +25,15 @@ pub struct Library {
     pub(super) running: Mutex<HashMap<(u64, u32), String>>,
     pub(super) max_maps: AtomicU64,
     pub(super) max_relabelled: AtomicU64,
-    /// Parts of the shapes that questions were chosen from lately.
+    /// Parts of shapes, remembered from recent questions.
     pub(super) parts: RememberedParts,
 }
 
 impl Library {
-    /// Opens the library in `dir`, which is created if it is missing.
+    /// Opens the library in `dir`, and creates the folder if it does not exist.
     ///
     /// # Errors
-    /// The folder is held by another process, cannot be written, or is of a newer format.
+    /// Another process holds the folder, it cannot be written, or its format is newer.
     pub fn open(dir: &Path) -> Result<Self> {
         Ok(Self::over(Store::open(dir)?))
     }
@@ -49,7 +49,7 @@ impl Library {
         }
     }
 
-    /// Verifies everything on disk against the catalog, of a library that no process holds.
+    /// Verifies all files of a library against the catalog. No process may hold the library.
     ///
     /// # Errors
     /// There is no library in `dir`, or it is held or unreadable.
@@ -57,22 +57,22 @@ impl Library {
         Ok(crate::store::check::check(dir)?)
     }
 
-    /// Copies the library in `from`, also while it is in use, to `to`, and verifies the copy: makes
-    /// a snapshot, or restores one.
+    /// Copies the library in `from`, also during its use, to `to`, and verifies the copy. This
+    /// makes or restores a snapshot.
     ///
     /// # Errors
-    /// There is no library in `from`, something in `to`, or the copy cannot be written.
+    /// There is no library in `from`, `to` is not empty, or the copy cannot be written.
     pub fn copy(from: &Path, to: &Path, link: bool) -> Result<Snapshot> {
         Ok(crate::store::snapshot::copy(from, to, link)?)
     }
 
-    /// The store, for care: its health and the sweep of orphans.
+    /// Returns the store, for its health and the sweep of orphans.
     pub fn store(&self) -> &Store {
         &self.store
     }
 
-    /// Runs `work` on a collection, alone. After an error, and after another process has changed
-    /// the collection, it is loaded again, so that it cannot differ from the catalog.
+    /// Runs `work` with exclusive use of a collection. The collection is reloaded after an error,
+    /// and after another process has changed it, so it never differs from the catalog.
     pub(super) fn with_collection<T>(
         &self,
         row: CollectionRow,
@@ -80,7 +80,8 @@ impl Library {
     ) -> Result<T> {
         let slot = self.slot(row.id);
         let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
-        // The row as it is now that nobody else uses the collection: the caller's may be older.
+        // Reads the row again now that nobody else uses the collection, because the caller's may be
+        // older.
         let (id, name) = (row.id, row.name);
         let row = self.row_of(id)?;
         let row = row.ok_or_else(|| LibraryError::not_found(Named::Collection, &name))?;
@@ -93,7 +94,7 @@ impl Library {
                 *slot = Some(collection);
                 Ok(done)
             }
-            // Whatever was missing then: deleting a collection waits for nobody.
+            // Any error may follow from the deletion of the collection, which waits for nobody.
             Err(LibraryError::Store(_)) if self.row_of(id)?.is_none() => {
                 Err(LibraryError::deleted(&name))
             }
@@ -101,14 +102,15 @@ impl Library {
         }
     }
 
-    /// Runs `work` while nothing in this process uses a collection, so that another process can.
+    /// Runs `work` while nothing in this process uses a collection, so that another process can use
+    /// it.
     ///
     /// # Errors
     /// There is no such collection.
     pub fn with_exclusive<T>(&self, collection: &str, work: impl FnOnce() -> T) -> Result<T> {
         let slot = self.slot(self.collection_row(collection)?.id);
         let mut slot = slot.lock().unwrap_or_else(PoisonError::into_inner);
-        // The other process loads its own: one copy is enough.
+        // The other process loads a copy of its own, and one copy in memory is enough.
         *slot = None;
         Ok(work())
     }
@@ -121,7 +123,7 @@ impl Library {
         Arc::clone(all.entry(id).or_default())
     }
 
-    /// Forgets a collection that was deleted. Who uses it still has it, and finds no row.
+    /// Removes a deleted collection from memory. A thread that still uses it finds no row.
     pub(super) fn forget_collection(&self, id: CollectionId) {
         let mut all = self
             .collections

@@ -1,28 +1,31 @@
-//! The newest change that a person made to a collection is undone.
+//! Undoes the newest change that a person made to a collection.
 
 use super::before::{Before, Rest};
 use super::change::{Change, LabelEdit, commit_once};
 use super::collection::{Collection, State};
 use super::error::{LibraryError, Result};
+use super::event::EventKind;
 use super::facade::Library;
 use super::labelling::{NewLabels, Relabelled, cause};
 use super::once::{Request, answered, from_reply};
 use super::reason::Reason;
 use super::rows::{damaged, to_json};
 use super::sources::Sources;
-use super::types::{EventKind, RequestKey};
+use super::types::RequestKey;
 use crate::store::{CorrectionRow, LabelsBefore, ReviewRow, ShapeId};
 use serde::{Deserialize, Serialize};
 
-/// What was undone.
+/// The result of undoing a change.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
-    /// The change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split` or `up`.
+    /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split` or
+    /// `up`.
     pub change: String,
-    /// What it changed: a shape, a label or an axis; empty for what an earlier version answered.
+    /// What the change concerned: a shape, a label or an axis; empty in a reply that an earlier
+    /// version stored.
     #[serde(default)]
     pub subject: String,
-    /// Changes by a person that can still be undone.
+    /// Number of changes by persons that can still be undone.
     pub n_left: u64,
     /// Sequence number of the collection after it.
     pub sequence: u64,
@@ -30,8 +33,8 @@ pub struct Undone {
 
 impl Library {
     /// Undoes the newest change that a person made to a collection: a correction, a name, a merge,
-    /// a split or another up axis. Shapes have the labels again that they had before it; those that
-    /// came since are relabelled. May be repeated, back to the first change; cannot itself be
+    /// a split or another up axis. Shapes get the labels back that they had before it; shapes that
+    /// were added since are relabelled. Can be repeated, back to the first change. Cannot itself be
     /// undone.
     ///
     /// # Errors
@@ -70,7 +73,7 @@ impl Library {
     }
 }
 
-/// The subject of a change, of its details as they are stored.
+/// Returns the subject of a change from its stored details.
 fn subject(detail: &str) -> String {
     let detail: serde_json::Value = serde_json::from_str(detail).unwrap_or_default();
     let found = ["shape", "label", "from"]
@@ -83,7 +86,7 @@ fn subject(detail: &str) -> String {
     }
 }
 
-/// The change that undoes the newest change by a person.
+/// Returns the change that undoes the newest change by a person.
 fn undoing(
     collection: &Collection,
     sources: &dyn Sources,
@@ -102,7 +105,7 @@ fn undoing(
     for label in sources.labels(collection.id())? {
         change.labels.push(match before.label(label.id) {
             Some(old) => LabelEdit::Restored(old),
-            // Its id is not used again, and stays resolvable.
+            // Its id is not used again, and remains resolvable.
             None => LabelEdit::Retired(label.id),
         });
     }
@@ -131,12 +134,12 @@ fn undoing(
         }
     }
     change.state = Some(state);
-    // Without a model before, there were no shapes: the model of those that came since goes on.
+    // Without a model before the change there were no shapes. The model of those added since stays.
     change.model = before.model()?;
     Ok(change)
 }
 
-/// The labels that a change replaced, as new versions.
+/// Returns the labels that a change replaced, as new versions.
 fn restored(
     collection: &Collection,
     sources: &dyn Sources,

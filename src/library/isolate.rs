@@ -1,6 +1,7 @@
-//! The work on one shape as bytes, so that another process can do it: the job, and its outcome.
+//! Encodes the work on one shape as bytes, so that another process can do it: the job and its
+//! outcome.
 //!
-//! Both ends are the same program, so nothing here has a version.
+//! Both ends are the same program, so the format has no version.
 
 use super::error::{LibraryError, Result};
 use super::refusal::refusal;
@@ -11,7 +12,7 @@ use crate::pipeline::{Description, Params, describe};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-/// A shape to be described, and how.
+/// A shape to be described, with format and parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DescribeJob<'a> {
     /// The bytes of a mesh file.
@@ -22,14 +23,14 @@ pub struct DescribeJob<'a> {
     pub params: Params,
 }
 
-/// A description, or why the shape is refused.
+/// A description, or the reason why the shape was refused.
 pub type Described = std::result::Result<Description, Failure>;
 
 /// The origin of the bytes, in errors.
 const LOCATION: &str = "the worker's answer";
 
-/// [`Description`] for serde, which domain types do not know. It fails to compile if a field is
-/// missing.
+/// A mirror of [`Description`] for serde, because domain types do not derive it. It does not
+/// compile if a field is missing.
 #[derive(Serialize, Deserialize)]
 #[serde(remote = "Description")]
 struct DescriptionFields {
@@ -51,14 +52,14 @@ struct DescriptionFields {
     signature: Vec<f32>,
 }
 
-/// A description, owned or borrowed, as serde sees it.
+/// A mirror of a description, owned or borrowed, for serde.
 #[derive(Serialize)]
 struct Encoded<'a>(#[serde(with = "DescriptionFields")] &'a Description);
 
 #[derive(Deserialize)]
 struct Decoded(#[serde(with = "DescriptionFields")] Description);
 
-/// A report as its counts by name.
+/// Encodes a report as its counts by name.
 mod report {
     use crate::library::isolate::LOCATION;
     use crate::library::rows::{report_from_json, report_to_json};
@@ -82,16 +83,16 @@ mod report {
 }
 
 impl DescribeJob<'_> {
-    /// Describes the shape in this process. `stage` is called with the name of each stage as it
-    /// begins; when it returns false the work stops.
+    /// Describes the shape in this process. Calls `stage` with the name of each stage as it begins,
+    /// and stops when it returns false.
     ///
     /// # Errors
-    /// Why the shape is refused, or that it was stopped.
+    /// The shape is refused, or the work was stopped.
     pub fn run(&self, stage: &dyn Fn(&str) -> bool) -> Described {
         describe(self.bytes, self.format, &self.params, stage).map_err(|e| refusal(&e))
     }
 
-    /// Everything but the bytes.
+    /// Returns all fields except the bytes.
     pub fn header(&self) -> Value {
         json!({
             "format": self.format.name(),
@@ -105,10 +106,10 @@ impl DescribeJob<'_> {
 }
 
 impl<'a> DescribeJob<'a> {
-    /// The job of a header that [`DescribeJob::header`] made, and of the bytes.
+    /// Returns the job of the bytes and of a header that [`DescribeJob::header`] made.
     ///
     /// # Errors
-    /// The header is not one.
+    /// The value is not such a header.
     pub fn from_header(header: &Value, bytes: &'a [u8]) -> Result<Self> {
         let text = |name: &str| header[name].as_str().unwrap_or_default();
         let number = |name: &str| {
@@ -129,16 +130,16 @@ impl<'a> DescribeJob<'a> {
     }
 }
 
-/// An outcome as bytes.
+/// Encodes an outcome.
 pub fn encode(outcome: &Described) -> Vec<u8> {
     let outcome = outcome.as_ref().map(Encoded);
     postcard::to_stdvec(&outcome).expect("invariant: lengths are known and memory grows")
 }
 
-/// The outcome of bytes that [`encode`] made.
+/// Decodes an outcome that [`encode`] made.
 ///
 /// # Errors
-/// The bytes are no outcome, or more than one.
+/// The bytes are not exactly one outcome.
 pub fn decode(bytes: &[u8]) -> Result<Described> {
     let (outcome, rest): (std::result::Result<Decoded, Failure>, _) =
         postcard::take_from_bytes(bytes).map_err(|e| bad(&e.to_string()))?;

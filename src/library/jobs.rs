@@ -1,4 +1,4 @@
-//! Jobs for the operator: attempts that failed, jobs that failed, and trying again.
+//! Reads jobs, counts failed attempts, and retries failed jobs.
 
 use super::collection::State;
 use super::error::{LibraryError, Named, Result};
@@ -11,34 +11,34 @@ use serde::{Deserialize, Serialize};
 use std::sync::PoisonError;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Jobs that are over are kept this long, and so are the bytes of shapes that failed.
+/// Age until which finished jobs, and the bytes of shapes that failed, are stored.
 const JOB_AGE_SECS: u64 = 30 * 24 * 60 * 60;
-/// Replies are kept this long.
+/// Age until which replies are stored.
 const REPLY_AGE_SECS: u64 = 7 * 24 * 60 * 60;
 
 /// The stored detail of an item that is still queued.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Attempts {
-    /// How often the work on it ended its process.
+    /// Number of times that the work on the item ended its process.
     pub(super) attempts: u32,
-    /// How the work ended the last time.
+    /// How the work ended most recently.
     why: String,
 }
 
-/// Which jobs to list.
+/// Selects jobs to list.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
-    /// Only those of which a shape failed, with only the failed shapes.
+    /// Selects only jobs with a failed shape, and only their failed shapes.
     pub failed: bool,
-    /// Only those older than this one; 0: from the newest.
+    /// Selects only jobs older than this one; 0 begins with the newest.
     pub before: u64,
-    /// Only those of one collection.
+    /// Selects only jobs of one collection.
     pub collection: Option<String>,
 }
 
 impl Library {
-    /// How far the correction of a job is propagated. Nothing remains to be done once the collection is
-    /// deleted, or once a later change has taken its place.
+    /// Returns the progress of the propagation of a job's correction. Nothing remains to be done
+    /// once the collection is deleted, or once a later change has replaced the correction.
     pub(super) fn propagation(&self, job: u64, collection: &str) -> Result<PropagationProgress> {
         self.store
             .catalog()
@@ -102,10 +102,10 @@ impl Library {
         })
     }
 
-    /// A job as it stands.
+    /// Returns a job.
     ///
     /// # Errors
-    /// There is none of the id.
+    /// There is no job of this id.
     pub fn job(&self, id: u64) -> Result<Job> {
         let (job, items) = self.store.catalog().read(|r| -> Result<_> {
             let job = r.job(id)?;
@@ -129,7 +129,8 @@ impl Library {
         })
     }
 
-    /// Items not yet done, in order of acceptance: a daemon resumes them when it starts.
+    /// Returns the items that are not done, in order of acceptance. A daemon resumes them when it
+    /// starts.
     ///
     /// # Errors
     /// The catalog cannot be read.
@@ -161,7 +162,7 @@ impl Library {
         self.job(job)
     }
 
-    /// Counts durably that the work on an item ended its process once more; returns the new count.
+    /// Durably counts another attempt on an item that ended its process. Returns the new count.
     ///
     /// # Errors
     /// The catalog cannot be written.
@@ -169,7 +170,7 @@ impl Library {
         self.store.catalog().write(|tx| {
             let row = tx.job_item(item.job, item.index)?;
             let Some(row) = row.filter(|r| r.status == ItemStatus::Queued) else {
-                // Cancelled meanwhile.
+                // The item was cancelled meanwhile.
                 return Ok(0);
             };
             let attempts = self.item(row)?.attempts + 1;
@@ -180,7 +181,7 @@ impl Library {
         })
     }
 
-    /// Jobs, newest first, at most `limit`.
+    /// Returns at most `limit` jobs, newest first.
     ///
     /// # Errors
     /// The catalog cannot be read.
@@ -215,11 +216,11 @@ impl Library {
             .collect()
     }
 
-    /// Queues the failed items of a job again, with all attempts before them; the job, and which
-    /// items.
+    /// Queues the failed items of a job again and resets the count of their attempts. Returns the
+    /// job and these items.
     ///
     /// # Errors
-    /// There is no such job, or the bytes of a failed shape are kept no longer.
+    /// There is no such job, or the bytes of a failed shape are no longer stored.
     pub fn retry(&self, job: u64) -> Result<(Job, Vec<JobItem>)> {
         self.job(job)?;
         let queued = self.store.catalog().write(|tx| -> Result<Vec<u32>> {
@@ -235,7 +236,7 @@ impl Library {
                     return Err(LibraryError::FailedPrecondition {
                         reason: Reason::OriginalGone,
                         message: format!(
-                            "the bytes of shape {:?} are kept no longer; add it again",
+                            "the bytes of shape {:?} are no longer stored; add it again",
                             row.item.name
                         ),
                     });
@@ -251,8 +252,8 @@ impl Library {
         Ok((job, items))
     }
 
-    /// Forgets replies and jobs that are so old that nobody asks for them. To be called about
-    /// hourly; a clock that jumps makes nothing older.
+    /// Deletes replies and jobs beyond their age. Call it about hourly. A clock that jumps makes
+    /// nothing older.
     ///
     /// # Errors
     /// The catalog cannot be written.

@@ -1,10 +1,11 @@
-//! Labellings of a proxy become labels of the polygons of its file, and new versions of a shape's
-//! labels.
+//! Converts labellings of a proxy to labels of the polygons of its file, and to new versions of a
+//! shape's labels.
 
 use super::error::Result;
+use super::event::LabelMove;
 use super::rows::{format_from_name, to_json};
 use super::sources::{FileView, Known, Sources};
-use super::types::{LabelId, LabelMove, PartInfo, Source};
+use super::types::{LabelId, PartInfo, Source};
 use crate::correspondence::parts;
 use crate::labels::refine_boundary;
 use crate::mesh;
@@ -33,7 +34,7 @@ pub(super) struct NewLabels {
 }
 
 impl NewLabels {
-    /// The same labels with the shapes that voted for them.
+    /// Returns the same labels with the shapes that voted for them.
     pub(super) fn voted_by(mut self, sources: &[Source]) -> Self {
         self.row.sources_json = to_json(&sources);
         self
@@ -50,7 +51,7 @@ pub(super) struct Relabelled {
 }
 
 impl Relabelled {
-    /// These labels as the next version of a stored shape's.
+    /// Makes these labels the next version of a stored shape's labels.
     pub(super) fn new(known: &Known, mut labels: NewLabels, cause: &'static str) -> Self {
         labels.row.version = known.row.version + 1;
         labels.row.cause = cause.into();
@@ -68,15 +69,15 @@ impl Relabelled {
     }
 }
 
-/// The file that a shape was described from.
+/// The file from which a shape was described.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Original<'a> {
     pub(super) digest: &'a Digest,
     pub(super) format: &'a str,
 }
 
-/// Labels of the file's polygons, of the proxy's faces, and of the parts they make; `ids` are the
-/// labels of the classes, and `epoch` that of their model.
+/// Returns the labels of the file's polygons and of the proxy's faces, and the parts that they
+/// make. `ids` are the labels of the classes, and `epoch` is that of their model.
 pub(super) fn new_labels(
     sources: &dyn Sources,
     shape: FileView<'_>,
@@ -95,7 +96,7 @@ pub(super) fn new_labels(
         .zip(view.face_map)
         .map(|(class, f)| labelling.probabilities[*f as usize * k + *class as usize])
         .collect();
-    // Two classes may be one label, after labels were merged.
+    // Two classes may have the same label after labels were merged.
     let ids_of_face: Vec<u32> = labelling.classes.iter().map(|c| ids[*c as usize]).collect();
     let infos = part_infos(&surface, &ids_of_face, |f| {
         probability(f, labelling.classes[f])
@@ -121,7 +122,7 @@ pub(super) fn new_labels(
     })
 }
 
-/// [`new_labels`] of a stored shape.
+/// Computes [`new_labels`] of a stored shape.
 pub(super) fn new_labels_of(
     sources: &dyn Sources,
     known: &Known,
@@ -135,7 +136,7 @@ pub(super) fn new_labels_of(
     new_labels(sources, known.file(), labelling, ids, original)
 }
 
-/// Share of the area that each label covers.
+/// Returns the share of the area that each label covers.
 pub(super) fn area_shares(view: &DescriptionView<'_>, labels: &[i32]) -> Vec<(LabelId, f64)> {
     let mut shares = BTreeMap::<LabelId, f64>::new();
     for (label, area) in labels.iter().zip(view.polygon_area) {
@@ -146,12 +147,13 @@ pub(super) fn area_shares(view: &DescriptionView<'_>, labels: &[i32]) -> Vec<(La
     shares.into_iter().collect()
 }
 
-/// The label ids of faces all of which have one.
+/// Converts labels of faces that are all labelled to ids.
 pub(super) fn face_ids(labels: &[i32]) -> Vec<LabelId> {
     labels.iter().map(|l| *l as LabelId).collect()
 }
 
-/// The parts that the labels of proxy faces make; `confidence` is that of a face, from 0 to 1.
+/// Returns the parts that the labels of proxy faces make. `confidence` returns the confidence of a
+/// face, from 0 to 1.
 pub(super) fn part_infos(
     surface: &Surface,
     ids: &[LabelId],
@@ -171,8 +173,8 @@ pub(super) fn part_infos(
         .collect()
 }
 
-/// Class of each polygon: that of its proxy face, with boundaries refined where the input is finer
-/// than the proxy.
+/// Returns the class of each polygon: that of its proxy face, with boundaries refined where the
+/// input is finer than the proxy.
 fn polygon_classes(
     sources: &dyn Sources,
     view: &DescriptionView<'_>,
@@ -192,8 +194,8 @@ fn polygon_classes(
     }
     let format = format_from_name(original.format, "shapes.format")?;
     let bytes = sources.original(original.digest)?;
-    // The same bytes passed these two steps when they were described, perhaps by a release that
-    // read other polygons in them.
+    // The same bytes passed these two steps when they were described, but perhaps in a release that
+    // read other polygons from them.
     let Ok(parsed) = mesh::parse(&bytes, format) else {
         return Ok(plain());
     };
@@ -255,7 +257,7 @@ fn mean_edge(mesh: &mesh::TriMesh) -> f64 {
     sum / (3 * mesh.faces.len()).max(1) as f64
 }
 
-/// Area that moves from label to label, largest first; empty if nothing changes.
+/// Returns the area that moves from label to label, largest first; empty if nothing changes.
 pub(super) fn moves(before: &[i32], after: &[i32], area: &[f32]) -> Vec<LabelMove> {
     let mut moved = BTreeMap::<(i32, i32), f64>::new();
     for ((b, a), w) in before.iter().zip(after).zip(area) {

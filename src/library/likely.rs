@@ -3,14 +3,14 @@
 use std::cmp::Reverse;
 use strsim::osa_distance;
 
-/// Longest names that are compared, in characters: what is compared costs the product of the
-/// lengths.
+/// Maximum number of characters of names that are compared: the cost of a comparison is the product
+/// of the lengths.
 const LONGEST: usize = 64;
-/// Most letters that differ, however long a name is.
+/// Maximum number of letters that may differ, however long a name is.
 const MOST_SLIPS: usize = 3;
 
-/// The known name that is most like `name`, if one is so like it that it was probably meant: the
-/// same in other letter case, or a slip for each three letters away, at most three.
+/// Returns the known name that is most similar to `name`, if it was probably meant: it differs only
+/// in case, or in at most one letter for every three, and in at most three.
 pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let wanted = name.to_lowercase();
     let n = wanted.chars().count();
@@ -24,8 +24,8 @@ pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Op
             return None;
         }
         let distance = osa_distance(&wanted, &folded);
-        // Of names as near, the one that begins the same: `chair-1` meant `chair-001`, not
-        // `chairs`.
+        // Among equally near names, prefer the one with the longest common beginning: `chair-1`
+        // probably meant `chair-001`, not `chairs`.
         let begins = wanted.chars().zip(folded.chars());
         let n_same = begins.take_while(|(a, b)| a == b).count();
         (distance <= slips).then_some(((distance, Reverse(n_same)), candidate))
@@ -34,7 +34,7 @@ pub fn likeliest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Op
         .map(|(_, candidate)| candidate)
 }
 
-/// The question that follows an error about a name, or nothing.
+/// Returns the question that follows an error about a name, or nothing.
 pub fn did_you_mean(nearest: Option<&str>) -> String {
     nearest.map_or_else(String::new, |name| format!("; did you mean {name:?}?"))
 }

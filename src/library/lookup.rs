@@ -1,14 +1,14 @@
-//! Rows are looked up by name; where there is none, the error says which name may have been meant.
+//! Looks up rows by name. If there is none, the error suggests the name that was probably meant.
 
 use super::error::{LibraryError, Named, Result};
 use super::sources::object;
 use crate::store::{CollectionRow, Digest, ObjectKind, Reader, ShapeRow, Store};
 
-/// Names among which one that was probably meant is looked for, so that a wrong name costs little
-/// in any library.
+/// Maximum number of names among which a suggestion is sought, so that a wrong name costs little in
+/// any library.
 const MAX_COMPARED: u32 = 5_000;
 
-/// The collection of that name; if there is none, the error says which may have been meant.
+/// Returns the collection of this name. If there is none, the error suggests another name.
 pub(super) fn require_collection(reader: &Reader<'_>, name: &str) -> Result<CollectionRow> {
     if let Some(row) = reader.collection(name)? {
         return Ok(row);
@@ -17,7 +17,7 @@ pub(super) fn require_collection(reader: &Reader<'_>, name: &str) -> Result<Coll
     Err(LibraryError::none_of(Named::Collection, name, &known))
 }
 
-/// A collection and a shape of it by their names.
+/// Returns a collection and a shape of it by their names.
 pub(super) fn require_shape(
     reader: &Reader<'_>,
     collection: &str,
@@ -33,7 +33,7 @@ pub(super) fn require_shape(
     }
 }
 
-/// Bytes in the file of a stored mesh.
+/// Returns the number of bytes in the file of a stored mesh.
 pub(super) fn object_length(store: &Store, original: &Digest) -> Result<u64> {
     Ok(object(store, ObjectKind::Original, original)?.length)
 }

@@ -1,4 +1,4 @@
-//! A person makes one label of two, or two of one.
+//! Merges two labels into one, and splits one label into two.
 
 use super::change::{Change, Undoable, commit_once};
 use super::collection::state::{Discovered, Supervision};
@@ -26,12 +26,12 @@ struct Renamed {
 }
 
 impl Library {
-    /// Makes one label of two: faces of `label` carry `into` from then on, on every shape. Returns
-    /// the label as it stands, and the number of shapes whose labels changed. Costs as much as
-    /// there are shapes that carry it.
+    /// Merges one label into another: faces with `label` have `into` from then on, on every shape.
+    /// Returns the remaining label, and the number of shapes whose labels changed. Costs as much as
+    /// there are shapes with the label.
     ///
     /// # Errors
-    /// There is no such collection or label, or one of them is out of use.
+    /// There is no such collection or label, or one of them is not in use.
     pub fn merge_labels(
         &self,
         collection: &str,
@@ -65,8 +65,8 @@ impl Library {
         })
     }
 
-    /// The reply that was stored before. An earlier version stored less of it; the label is then
-    /// returned as it stands.
+    /// Returns the reply that was stored before. An earlier version stored less of it; then the
+    /// label is read again.
     fn replied(
         &self,
         reply: &[u8],
@@ -81,13 +81,13 @@ impl Library {
         })
     }
 
-    /// Makes two labels of one, by what tells its patches apart most over the collection (two means
-    /// of their mean descriptors), then face by face (the discriminant of the two, and a cut). The
-    /// larger share keeps the id. Returns the new label, and the number of shapes whose labels
-    /// changed at once; the others follow in the background.
+    /// Splits one label into two by the difference of its patches that is greatest over the
+    /// collection (two means of their mean descriptors), then face by face (the discriminant of the
+    /// two, and a cut). The larger share keeps the id. Returns the new label, and the number of
+    /// shapes whose labels changed at once; the others follow in the background.
     ///
     /// # Errors
-    /// There is no such collection or label, it is out of use, or it has too few patches to be two.
+    /// There is no such collection or label, it is not in use, or it has fewer than two patches.
     pub fn split_label(
         &self,
         collection: &str,
@@ -124,7 +124,7 @@ fn require_in_use(labels: &[LabelRow], label: LabelId) -> Result<()> {
     }
 }
 
-/// What merging a label into another changes, on the shapes that carry it.
+/// Returns the change that merges a label into another, on the shapes that have it.
 fn merge(
     collection: &Collection,
     sources: &dyn Sources,
@@ -171,7 +171,7 @@ fn merge(
     })
 }
 
-/// What splitting a label changes at once: on training shapes, and on those that show discovered
+/// Returns the change that splits a label: on training shapes, and on shapes with discovered
 /// labels.
 fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Result<Change> {
     let Some(model) = collection.label_model() else {
@@ -259,7 +259,7 @@ fn too_few(label: LabelId) -> LibraryError {
     }
 }
 
-/// A new version of a shape's labels with other ids.
+/// Returns a new version of a shape's labels with other ids.
 fn renamed_labels(known: &Known, renamed: Renamed, cause: &'static str) -> Relabelled {
     let view = known.view();
     let surface = Surface::new(&view.mesh());
@@ -284,7 +284,8 @@ fn renamed_labels(known: &Known, renamed: Renamed, cause: &'static str) -> Relab
     Relabelled::new(known, NewLabels { row, summary }, cause)
 }
 
-/// Probabilities `(m, k + 1)` in which the faces of the new last class have what their old one had.
+/// Returns probabilities `(m, k + 1)` in which the faces of the new last class have the
+/// probabilities of their old class.
 fn with_new_class(old: &LabelVersionRow, k: usize, labels: &[LabelId], proxy: &[i32]) -> Vec<u8> {
     let mut out = vec![0; proxy.len() * (k + 1)];
     let new = labels[k] as i32;

@@ -36,6 +36,7 @@ mod collection;
 mod collections;
 mod correct;
 mod error;
+mod event;
 mod facade;
 mod history;
 pub mod isolate;
@@ -74,6 +75,7 @@ pub use collection::discovered::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_r
 pub use collections::MAX_PARTS;
 pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
 pub use error::{LibraryError, Named};
+pub use event::{Event, EventKind, LabelMove};
 pub use facade::Library;
 pub use history::Undone;
 pub use jobs::JobFilter;
@@ -87,10 +89,9 @@ pub use rows::report_to_json;
 pub use submit::{Described, Describer, StoredOriginals, Submission};
 pub use suggest::Suggestion;
 pub use types::{
-    CollectionInfo, CollectionSpec, Event, EventKind, Failure, FailureSubject, ItemState, Job,
-    JobItem, LabelId, LabelInfo, LabelMove, Labels, LibraryStats, MapInfo, NewShape, Outcome,
-    PartInfo, PartMatch, Placed, PropagationProgress, RequestKey, ShapeInfo, Source, Up,
-    UpEstimate,
+    CollectionInfo, CollectionSpec, Failure, FailureSubject, ItemState, Job, JobItem, LabelId,
+    LabelInfo, Labels, LibraryStats, MapInfo, NewShape, Outcome, PartInfo, PartMatch, Placed,
+    PropagationProgress, RequestKey, ShapeInfo, Source, Up, UpEstimate,
 };
 pub use upright::UpSet;
 pub use verdict::{Review, ReviewState};

@@ -1,4 +1,5 @@
-//! Names that people, file systems and logs can live with, and how others are shown.
+//! Checks names, so that people, file systems and logs can handle them, and shows text that may
+//! contain others.
 
 use super::error::{LibraryError, Result};
 use super::reason::Reason;
@@ -8,18 +9,18 @@ use std::borrow::Cow;
 const LOOKALIKES: &str = "АВЕКМНОРСТУХаеорсухіІјЈѕЅһԁԛԜԝҮүӀӏ\
                           ΑΒΕΖΗΙΚΜΝΟΡΤΥΧοναινυρ";
 
-/// Characters of a shape's name.
+/// Maximum number of characters of a shape's name.
 const MAX_SHAPE_NAME: usize = 255;
 
-/// Refuses what cannot be the name of a shape.
+/// Refuses a name that is not valid for a shape.
 ///
 /// # Errors
-/// The name is too long, empty, or has characters that are not allowed.
+/// The name is too long or empty, or contains characters that are not allowed.
 pub fn check_shape_name(name: &str) -> Result<()> {
     check_name("shape", name, MAX_SHAPE_NAME)
 }
 
-/// Refuses a name that is too long, cannot stand in a path, or has characters that nobody sees.
+/// Refuses a name that is too long, cannot be part of a path, or contains invisible characters.
 pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
     let bad = |message: String| Err(LibraryError::invalid(Reason::BadName, message));
     let n = name.chars().count();
@@ -37,8 +38,8 @@ pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
     if let Some(i) = (0..n).find(|&i| is_hidden(&chars, i)) {
         let (text, code) = (shown(name), u32::from(chars[i]));
         return bad(format!(
-            "the {what} name \"{text}\" has the character U+{code:04X}, but characters that cannot be seen, or \
-             that turn the direction of others, are not allowed"
+            "the {what} name \"{text}\" has the character U+{code:04X}, but characters that \
+             cannot be seen, or that turn the direction of others, are not allowed"
         ));
     }
     if name == "." || name == ".." {
@@ -47,9 +48,9 @@ pub(super) fn check_name(what: &str, name: &str, limit: usize) -> Result<()> {
     Ok(())
 }
 
-/// Whether a character shows nothing of itself: names that differ by it look the same, or look like
-/// others. Joiners are part of scripts and of pictures; they hide between letters of ASCII and at
-/// the ends.
+/// Whether a character is invisible: names that differ by it look the same, or look like others.
+/// Joiners are part of scripts and of pictures, but are invisible between letters of ASCII and at
+/// the ends of a name.
 fn is_hidden(chars: &[char], i: usize) -> bool {
     match chars[i] {
         '\u{200c}' | '\u{200d}' => {
@@ -88,8 +89,8 @@ fn is_blank(c: char) -> bool {
     )
 }
 
-/// Text with names in it for people: what cannot be seen is written as its number, and so are
-/// letters that look like Latin ones within a word that has Latin ones too.
+/// Returns text that contains names, for people. Invisible characters are replaced by their
+/// numbers, and so are letters that look like Latin ones within a word that also has Latin ones.
 pub fn shown(text: &str) -> Cow<'_, str> {
     if text.is_ascii() {
         return Cow::Borrowed(text);

@@ -8,19 +8,19 @@ use crate::store::{Digest, RequestRow, Store, Tx};
 use serde::Deserialize;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// A request that takes effect once.
+/// A request that takes effect at most once.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Request<'a> {
-    /// `None`: nobody asks for it again.
+    /// `None` if nobody repeats the request.
     pub(super) key: Option<&'a RequestKey>,
-    /// Tells it from another request under the same key.
+    /// Distinguishes the request from another one with the same key.
     pub(super) digest: Digest,
-    /// The digest that an earlier version computed for the same request, if that is another one.
+    /// The digest that an earlier version computed for the same request, if it differs.
     pub(super) earlier: Option<Digest>,
 }
 
 impl<'a> Request<'a> {
-    /// A request that this text tells from every other.
+    /// A request that is identified by this text.
     pub(super) fn of(key: Option<&'a RequestKey>, text: &str) -> Self {
         Self::new(key, Digest::of(text.as_bytes()))
     }
@@ -38,8 +38,8 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Runs a change within a transaction unless its request was answered before; the reply, then or
-/// now.
+/// Runs a change within a transaction unless its request was answered before. Returns the new or
+/// the stored reply.
 pub(super) fn once(
     tx: &Tx<'_>,
     request: &Request<'_>,
@@ -62,7 +62,7 @@ pub(super) fn once(
     Ok(reply)
 }
 
-/// The reply to a request that was answered before.
+/// Returns the reply to a request that was answered before.
 pub(super) fn answered(store: &Store, request: &Request<'_>) -> Result<Option<Vec<u8>>> {
     let Some(key) = request.key else {
         return Ok(None);
@@ -87,19 +87,19 @@ fn same(request: &Request<'_>, key: &RequestKey, row: RequestRow) -> Result<Vec<
     })
 }
 
-/// A reply as it was stored.
+/// Decodes a stored reply.
 pub(super) fn from_reply<T: for<'de> Deserialize<'de>>(reply: &[u8]) -> Result<T> {
     let text = std::str::from_utf8(reply).map_err(|e| damaged("requests", &e.to_string()))?;
     from_json(text, "requests")
 }
 
-/// Milliseconds since 1970.
+/// Returns the time in milliseconds since 1970.
 pub(super) fn unix_ms() -> u64 {
     let elapsed = SystemTime::now().duration_since(UNIX_EPOCH);
     elapsed.map_or(0, |e| u64::try_from(e.as_millis()).unwrap_or(u64::MAX))
 }
 
-/// Now, in seconds since 1970.
+/// Returns the time in seconds since 1970.
 pub(super) fn unix_secs() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     now.map_or(0, |d| d.as_secs())

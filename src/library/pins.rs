@@ -1,4 +1,5 @@
-//! Faces that a person labelled: the classes they pin, and the labels that persons use.
+//! Faces that a person labelled: the classes to which they are pinned, and the labels that persons
+//! use.
 
 use super::collection::Collection;
 use super::collection::state::Vocabulary;
@@ -11,11 +12,10 @@ use crate::segmentation::Surface;
 use crate::store::{LabelVersionRow, ShapeId};
 use std::collections::{BTreeSet, VecDeque};
 
-/// Share of a shape's area that a person must have labelled for the shape to show which labels
-/// there are.
+/// Share of a shape's area that a person must have labelled for the shape to define the vocabulary.
 const WHOLE: f64 = 0.9;
 
-/// Labels that persons used, and whether they are all there is.
+/// The labels that persons used, and whether they are the whole vocabulary.
 #[derive(Debug)]
 pub(super) struct UsedLabels {
     pub(super) labels: BTreeSet<LabelId>,
@@ -31,7 +31,7 @@ pub(super) enum Instead<'a> {
     Removed(ShapeId),
 }
 
-/// The labels that persons used in a collection, given the change of one shape.
+/// Returns the labels that persons used in a collection, after the change of one shape.
 pub(super) fn used_labels(
     collection: &Collection,
     sources: &dyn Sources,
@@ -63,13 +63,13 @@ pub(super) fn used_labels(
     Ok(UsedLabels { labels, vocabulary })
 }
 
-/// The pins of a shape that a person labelled.
+/// Returns the pins of a shape that a person labelled.
 pub(super) fn pins_of(sources: &dyn Sources, id: ShapeId) -> Result<Vec<i32>> {
     let pins = sources.pins(id)?;
     pins.ok_or_else(|| damaged("pins", &format!("row {id} is gone")))
 }
 
-/// Share of the area of a shape that is pinned.
+/// Returns the share of the area of a shape that is pinned.
 pub(super) fn pinned_share(view: &DescriptionView<'_>, pins: &[i32]) -> f64 {
     let area = view.polygon_area.iter().map(|a| f64::from(*a));
     let total: f64 = area.clone().sum();
@@ -81,10 +81,10 @@ pub(super) fn pinned_share(view: &DescriptionView<'_>, pins: &[i32]) -> f64 {
     pinned / total.max(1e-300)
 }
 
-/// Class of each proxy face `(m,)` that a person labelled, given the pins `(n_polygons,)` and the
-/// label of each class; empty if nothing is pinned. If the whole shape is labelled, every proxy
-/// face is: one that stands for no polygon takes the class of the nearest face that does, so that
-/// no face keeps a label that nobody gave.
+/// Returns the class of each proxy face `(m,)` that a person labelled, from the pins
+/// `(n_polygons,)` and the label of each class; empty if nothing is pinned. If the whole shape is
+/// labelled, every proxy face gets a class: one that stands for no polygon takes the class of the
+/// nearest face that does, so that no face keeps a label that nobody gave.
 pub(super) fn pinned_faces<L: Copy + Into<i64>>(
     view: &DescriptionView<'_>,
     pins: &[i32],
@@ -106,7 +106,8 @@ pub(super) fn pinned_faces<L: Copy + Into<i64>>(
 }
 
 /// Gives each face without a class that of the nearest face with one, counted in steps over edges
-/// and bridges; of faces equally near, that of the one that was reached first, by ascending index.
+/// and bridges. Among equally near faces it is that of the face that was reached first, by
+/// ascending index.
 fn spread(surface: &Surface, classes: &mut [Option<u32>]) {
     let mut neighbours = vec![Vec::new(); classes.len()];
     for edge in &surface.edges {
@@ -126,7 +127,7 @@ fn spread(surface: &Surface, classes: &mut [Option<u32>]) {
     }
 }
 
-/// Puts the labels that a person gave in the place of those that were found.
+/// Overwrites computed labels with those that a person gave.
 pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
     let slots = row
         .polygon_labels
@@ -152,7 +153,7 @@ mod tests {
         let mut classes = vec![None; surface.n_faces()];
         spread(&surface, &mut classes);
         assert!(classes.iter().all(Option::is_none), "nothing to spread");
-        // Two opposite faces: each takes the half that it is in, up to the size of a face.
+        // Two opposite faces: each takes its half, up to the size of a face.
         let far = |a: usize, b: usize| -> f64 {
             let (a, b) = (surface.centroids[a], surface.centroids[b]);
             (0..3).map(|i| (a[i] - b[i]).powi(2)).sum()

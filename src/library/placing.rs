@@ -1,4 +1,4 @@
-//! A described shape is placed: related to a few known shapes, labelled, and committed.
+//! Places a described shape: relates it to a few known shapes, labels and commits it.
 
 use super::advance::{fit_model, relabel_all};
 use super::agreement::n_inconsistent;
@@ -46,11 +46,11 @@ impl Stages {
 }
 
 impl Library {
-    /// Places a described item and commits it, or commits that it failed. To be called in the order
-    /// of acceptance within a collection.
+    /// Places a described item and commits it, or commits that it failed. Call it in the order of
+    /// acceptance within a collection.
     ///
     /// # Errors
-    /// The store fails, or the collection is deleted meanwhile; a shape that is refused is an
+    /// The store fails, or the collection is deleted meanwhile. A shape that is refused is an
     /// [`ItemState::Failed`].
     pub fn place_item(
         &self,
@@ -96,10 +96,10 @@ impl Library {
         })
     }
 
-    /// Submits, describes and places one shape, for use in process.
+    /// Submits, describes and places one shape in this process.
     ///
     /// # Errors
-    /// As [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
+    /// Those of [`Library::submit`]; [`LibraryError::Refused`] if the shape is refused.
     pub fn add(&self, collection: &str, shape: ShapeToAdd) -> Result<Placed> {
         let job = self.submit(collection, &self.store_originals(vec![shape])?, None)?;
         let item = &job.items[0];
@@ -115,7 +115,7 @@ impl Library {
         }
     }
 
-    /// Settles an item whose shape is stored already.
+    /// Settles an item whose shape is already stored.
     fn unchanged(&self, item: &JobItem, version: u64, sequence: u64) -> Result<ItemState> {
         let placed = Placed {
             outcome: Outcome::Unchanged,
@@ -205,7 +205,7 @@ fn place(
     })
 }
 
-/// Writes that an item is done.
+/// Records that an item is done.
 fn settle(tx: &Tx<'_>, accepted: &JobItemRow, mut placed: Placed, sequence: u64) -> Result<Placed> {
     placed.sequence = sequence;
     let (job, index) = (accepted.job, accepted.index);
@@ -213,7 +213,7 @@ fn settle(tx: &Tx<'_>, accepted: &JobItemRow, mut placed: Placed, sequence: u64)
     Ok(placed)
 }
 
-/// The object of a description, which is made durable first, and what keeps its file until the
+/// Makes a description durable. Returns its object, and a guard that protects its file until the
 /// commit.
 fn store_description(
     store: &Store,
@@ -230,7 +230,8 @@ fn store_description(
     Ok(((ObjectRow::clone(&kept), Some(kept)), stages))
 }
 
-/// Takes a shape out of the collection before it is replaced; whether a person had labelled it.
+/// Takes a shape out of the collection before it is replaced. Returns whether a person had labelled
+/// it.
 fn set_aside(store: &Store, collection: &mut Collection, id: ShapeId) -> Result<bool> {
     let at = collection.position(id);
     let was_pinned = at.is_some_and(|at| collection.shapes()[at].pinned);
@@ -239,8 +240,9 @@ fn set_aside(store: &Store, collection: &mut Collection, id: ShapeId) -> Result<
     Ok(was_pinned)
 }
 
-/// Labels a new shape through maps, once the model is fitted or the voters are not stale; `None`:
-/// there is no model yet. And how many shapes were relabelled for that.
+/// Labels a new shape through maps, after fitting the model or relabelling stale voters where
+/// necessary. Returns the labelling, or `None` without a model, and the number of shapes that were
+/// relabelled for it.
 fn label_new(
     store: &Store,
     collection: &mut Collection,
@@ -259,7 +261,7 @@ fn label_new(
     Ok((voted, n_fresh))
 }
 
-/// What the addition of a labelled shape changes.
+/// Returns the plan of the changes that follow from the addition of a labelled shape.
 fn plan(
     store: &Store,
     collection: &mut Collection,
@@ -281,7 +283,8 @@ fn plan(
         }
     };
     if plan.state.up_disagrees.is_none() && collection.up().axis().is_some() {
-        // As in collections that were begun when nobody asked.
+        // No disagreement is known, perhaps because an earlier release began the collection without
+        // this check.
         let found =
             discovered::up_found(collection, store, collection.up(), Some(&new.arrays.view))?;
         plan.state.up_disagrees = found.disagrees;
@@ -317,7 +320,7 @@ fn relabelled(store: &Store, plan: &Plan) -> Result<Vec<Relabelled>> {
     shapes.collect()
 }
 
-/// The row of a new shape whose labels go on from `version`.
+/// Returns the row of a new shape. Its labels have the version after `version`.
 fn shape_row(
     store: &Store,
     collection: &Collection,
@@ -344,7 +347,7 @@ fn shape_row(
     })
 }
 
-/// Everything that becomes true with an addition.
+/// Returns the change that adds the shape.
 fn change(
     plan: Plan,
     addition: Box<Addition>,
@@ -371,7 +374,8 @@ fn taken(item: &JobItem) -> Failure {
         code: Code::AlreadyExists,
         reason: Reason::NameTaken,
         message: format!(
-            "collection {:?} has a shape named {:?} with other bytes; replace it or choose another name",
+            "collection {:?} has a shape named {:?} with other bytes; replace it or \
+             choose another name",
             item.collection, item.name
         ),
         subject: None,

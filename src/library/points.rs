@@ -1,4 +1,4 @@
-//! Maps between the points of two stored shapes, and values transferred through them.
+//! Computes maps between the points of two stored shapes, and transfers values through them.
 
 use super::error::{LibraryError, Result};
 use super::facade::Library;
@@ -13,19 +13,19 @@ use crate::pipeline::DescriptionView;
 use crate::store::PointMapRow;
 use serde::{Deserialize, Serialize};
 
-/// Part of the key of a stored map: raised when the same request would find another one.
+/// Part of the key of a stored map. Raise it when the same request would result in another map.
 const RECIPE: u32 = 1;
 
-/// What a map between points must satisfy.
+/// Requirements on a map between points.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PointRequest {
-    /// Proxy vertices of the first and of the second shape that correspond.
+    /// Pairs of corresponding proxy vertices of the first and the second shape.
     pub landmarks: Vec<[u32; 2]>,
-    /// Which orientation.
+    /// The orientation of the map.
     pub side: Side,
-    /// Rows and columns; 0: 100, or as many as both shapes have.
+    /// Number of rows and columns; 0: 100, or as many as both shapes have.
     pub k: usize,
-    /// Whether the best map of the other orientation is wanted too.
+    /// Whether to return also the best map of the other orientation.
     pub alternative: bool,
 }
 
@@ -39,11 +39,12 @@ pub enum PolygonValues {
 }
 
 impl Library {
-    /// The map that carries functions on `from` to `to` point by point, and if wanted the best one
-    /// of the other orientation after it. The maps are stored: the same request finds them again.
+    /// Returns the map that carries functions on `from` to `to` point by point and, if requested,
+    /// the best one of the other orientation after it. The maps are stored, and found again by the
+    /// same request.
     ///
     /// # Errors
-    /// There is no such shape, or a landmark is no vertex of its proxy.
+    /// There is no such shape, or a landmark is not a vertex of its proxy.
     pub fn point_maps(
         &self,
         collection: &str,
@@ -64,15 +65,15 @@ impl Library {
             .store
             .catalog()
             .write(|tx| -> Result<()> { Ok(tx.put_point_maps(a.id, b.id, &key, &rows)?) });
-        // Maps that cannot be stored, because a shape was removed meanwhile or the disk is full, are
-        // computed again when they are requested again.
+        // A map that cannot be stored, because a shape was removed meanwhile or the disk is full,
+        // is computed again when it is requested again.
         match write {
             Err(LibraryError::Store(e)) if e.is_damage() => Err(e.into()),
             _ => rows.into_iter().map(from_row).collect(),
         }
     }
 
-    /// What [`Library::point_maps`] returns if it is stored: nothing is computed.
+    /// Returns what [`Library::point_maps`] returns, if it is stored. Computes nothing.
     ///
     /// # Errors
     /// There is no such shape, or the map is damaged.
@@ -95,12 +96,13 @@ impl Library {
             .transpose()
     }
 
-    /// Values at the polygons of `from` become values at those of `to`, by the map between their
-    /// points: of labels the most frequent around the matched points, of functions the mean; −1 and
-    /// NaN where nothing corresponds.
+    /// Transfers values at the polygons of `from` to those of `to`, by the map between their
+    /// points. A polygon gets the most frequent label, or the mean of the functions, around the
+    /// matched points; −1 or NaN where nothing corresponds.
     ///
     /// # Errors
-    /// As [`Self::point_maps`]; or there is not one row for each polygon of `from`.
+    /// Those of [`Self::point_maps`]; or the number of rows differs from the number of polygons of
+    /// `from`.
     pub fn transfer(
         &self,
         collection: &str,
@@ -151,7 +153,7 @@ impl Library {
     }
 }
 
-/// The stored part of a map besides its arrays.
+/// The stored fields of a map besides its arrays.
 #[derive(Debug, Serialize, Deserialize)]
 struct Detail {
     descriptor_residual: f64,
@@ -166,7 +168,7 @@ struct Detail {
     cost: f64,
 }
 
-/// The key under which the maps of a request are stored.
+/// Returns the key under which the maps of a request are stored.
 fn request_key(request: &PointRequest) -> String {
     let PointRequest {
         landmarks,
@@ -262,7 +264,8 @@ fn shape<'a>(d: &DescriptionView<'a>, options: &EstimateOptions) -> PointShape<'
     PointShape::new(d.vertices, d.faces, basis, options)
 }
 
-/// Area-weighted mean of the polygons of each proxy face `(m, dim)`; 0 where there is none.
+/// Returns the area-weighted mean of the polygons of each proxy face `(m, dim)`; 0 for a face
+/// without polygons.
 fn mean(d: &DescriptionView<'_>, values: &[f32], dim: usize) -> Vec<f32> {
     let mut sum = vec![0.0f64; d.faces.len() * dim];
     let mut area = vec![0.0f64; d.faces.len()];
@@ -279,8 +282,8 @@ fn mean(d: &DescriptionView<'_>, values: &[f32], dim: usize) -> Vec<f32> {
         .collect()
 }
 
-/// The label with most area among the polygons of each proxy face `(m,)`; −1 where there is none,
-/// the lowest on ties.
+/// Returns the label with most area among the polygons of each proxy face `(m,)`; −1 for a face
+/// without polygons, and the lowest label on ties.
 fn most_frequent(d: &DescriptionView<'_>, labels: &[i32]) -> Vec<i32> {
     let mut kinds = labels.to_vec();
     kinds.sort_unstable();

@@ -24,12 +24,12 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Most shapes among whose parts the next question is chosen, besides those with answers: the cost
-/// grows with the square.
+/// Maximum number of shapes, besides those with answers, from whose parts the next question is
+/// chosen. The cost grows with the square.
 const MAX_ASKED: usize = 100;
-/// Most shapes with answers that are looked at, those with the least digests.
+/// Maximum number of shapes with answers that are considered: those with the least digests.
 const MAX_ANSWERED: usize = 60;
-/// Most bytes of a label's name.
+/// Maximum number of bytes of a label's name.
 const MAX_LABEL_NAME: usize = 128;
 
 /// A part that a person is asked about.
@@ -44,13 +44,13 @@ pub struct PartQuestion {
     pub faces: Vec<u32>,
     /// Its share of the shape's area.
     pub area_share: f64,
-    /// Probability that its likeliest label is wrong.
+    /// Probability that its most likely label is wrong.
     pub doubt: f64,
-    /// Area that the answer is expected to decide, in shapes.
+    /// Area that the answer is expected to decide, in units of a shape's area.
     pub gain: f64,
-    /// The likeliest labels.
+    /// The most likely labels.
     pub likeliest: Vec<OfferedLabel>,
-    /// Parts in which a person has labelled something.
+    /// Number of parts in which a person has labelled faces.
     pub n_answered: u64,
 }
 
@@ -67,25 +67,25 @@ pub struct OfferedLabel {
     pub used: bool,
 }
 
-/// What a person answers.
+/// A person's answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Answer {
     /// The part has this label.
     Label(LabelId),
     /// The part has the label of this name, which is created if no label is named so.
     Named(String),
-    /// The person does not want to say.
+    /// The person passes the question over.
     Skip,
-    /// The part does not have one label: it is cut wrongly.
+    /// The part has more than one label, because it is cut wrongly.
     CutWrongly,
 }
 
-/// What an answer did.
+/// The result of an answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answered {
-    /// The label that the part has now; `None`: it was passed over.
+    /// The new label of the part; `None` if it was passed over.
     pub label: Option<LabelId>,
-    /// The correction that this makes.
+    /// The correction that follows from the answer.
     pub corrected: Option<Corrected>,
 }
 
@@ -100,7 +100,7 @@ impl Answer {
     }
 }
 
-/// Why parts are passed over, as it is stored: skipped, cut wrongly.
+/// Stored names of the reasons why parts are passed over: skipped, cut wrongly.
 const PASSED: [&str; 2] = ["skip", "cut"];
 
 /// A shape among whose parts the next question is chosen.
@@ -112,7 +112,7 @@ struct Candidate {
     open: Vec<bool>,
 }
 
-/// What a collection has discovered, as far as questions need it.
+/// The discovered labels of a collection, as questions need them.
 struct Found<'a> {
     normalisation: &'a Normalisation,
     statistics: &'a Statistics,
@@ -120,10 +120,10 @@ struct Found<'a> {
 }
 
 impl Library {
-    /// The part whose label is worth most to ask a person for, as
-    /// [`next_question`](crate::pipeline::next_question) ranks them. It depends on the shapes and
-    /// on what persons have labelled, not on how far that is propagated. With `passed`, parts that
-    /// were passed over may be asked about again.
+    /// Returns the part whose label is most worth asking a person for, as ranked by
+    /// [`next_question`](crate::pipeline::next_question). It depends on the shapes and on the
+    /// labels that persons gave, not on the progress of their propagation. With `passed`, parts
+    /// that were passed over may be asked about again.
     ///
     /// # Errors
     /// There is no such collection, or every part of it was answered or passed over.
@@ -194,7 +194,7 @@ impl Library {
         })
     }
 
-    /// Takes the answer to a question: the part is pinned, and the labels of other shapes follow in
+    /// Takes the answer to a question. The part is pinned, and the labels of other shapes follow in
     /// the background. A part that is passed over is not asked about again.
     ///
     /// # Errors
@@ -283,7 +283,7 @@ impl Library {
         Ok(passed)
     }
 
-    /// The label of a name, and what creates it if there is none.
+    /// Returns the label of a name, and the edit that creates it if there is none.
     fn label_of_name(
         &self,
         collection: &Collection,
@@ -304,8 +304,8 @@ impl Library {
         Ok((id, Some(LabelEdit::Named(row, name.to_owned()))))
     }
 
-    /// The shapes among whose parts the next question is chosen: those of the least digests, with
-    /// answers and without.
+    /// Returns the shapes from whose parts the next question is chosen: those of the least digests,
+    /// with answers and without.
     fn candidates(
         &self,
         collection: &Collection,
@@ -363,12 +363,12 @@ impl Library {
     }
 }
 
-/// The up axis along which descriptors are taken.
+/// Returns the up axis along which descriptors are taken.
 fn axis(collection: &Collection) -> Option<[f64; 3]> {
     collection.label_model().and_then(|m| m.up)
 }
 
-/// The labels that were discovered, and the scale of descriptors.
+/// Returns the discovered labels and the scale of descriptors.
 fn found(collection: &Collection) -> Option<Found<'_>> {
     let model = collection.model()?;
     let supervision = collection.state().regime.supervision();
@@ -383,7 +383,7 @@ fn found(collection: &Collection) -> Option<Found<'_>> {
     })
 }
 
-/// The pins of the shapes that persons labelled, by index.
+/// Returns the pins of the shapes that persons labelled, by index.
 fn pins(collection: &Collection, sources: &dyn Sources) -> Result<BTreeMap<usize, Vec<i32>>> {
     let shapes = collection.shapes().iter().enumerate();
     let pinned = shapes.filter(|s| s.1.pinned);
@@ -392,14 +392,15 @@ fn pins(collection: &Collection, sources: &dyn Sources) -> Result<BTreeMap<usize
         .collect()
 }
 
-/// The polygons of a part.
+/// Returns the polygons of a part.
 fn faces_of(view: &DescriptionView<'_>, parts: &ShapeParts, part: u32) -> Vec<u32> {
     let polygons = (0..view.face_map.len() as u32).zip(view.face_map);
     let is_in = |face: &u32| parts.part_of_face[*face as usize] == part;
     polygons.filter(|p| is_in(p.1)).map(|p| p.0).collect()
 }
 
-/// The likeliest labels of a question, each once: discovered labels may have been merged.
+/// Returns the most likely labels of a question, each once, because discovered labels may have been
+/// merged.
 fn offered(
     question: &Question,
     used: &[LabelId],
@@ -432,11 +433,11 @@ fn offered(
     out
 }
 
-/// The label that an id stands for after merges.
+/// Returns the label to which an id resolves after merges.
 fn resolved(labels: &[LabelRow], id: LabelId) -> Option<&LabelRow> {
     let find = |id: LabelId| labels.iter().find(|l| l.id == id);
     let mut row = find(id)?;
-    // Chains are as long as there are labels at most.
+    // A chain has at most as many links as there are labels.
     for _ in 0..labels.len() {
         match row.merged_into {
             Some(next) => row = find(next)?,

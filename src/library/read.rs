@@ -1,6 +1,7 @@
 //! Reads shapes, labels, arrays, maps and events from the store. Nothing here writes.
 
 use super::error::{LibraryError, Named, Result};
+use super::event::{Event, EventKind};
 use super::facade::Library;
 use super::labelling::face_ids;
 use super::lookup::{object_length, require_collection};
@@ -9,9 +10,7 @@ use super::rows::{
     confidence_of_row, damaged, format_from_name, from_json, quality_from_json, report_from_json,
 };
 use super::sources::{Sources, mapped_shape};
-use super::types::{
-    Event, EventKind, LabelId, Labels, LibraryStats, MapInfo, PartMatch, ShapeInfo,
-};
+use super::types::{LabelId, Labels, LibraryStats, MapInfo, PartMatch, ShapeInfo};
 use super::verdict::{Review, ReviewState};
 use super::voting::PreparedShape;
 use crate::correspondence::{overlaps, part_of_vertex, parts};
@@ -24,8 +23,8 @@ use crate::store::{LabelVersionRow, MappedDescription, ShapeRow};
 use std::sync::atomic::Ordering;
 
 impl Library {
-    /// Shapes by ordinal, after `after_ordinal`, at most `limit`; with `label`, only those that
-    /// carry it.
+    /// Returns shapes by ordinal, after `after_ordinal`, at most `limit`; with `label`, only those
+    /// that have it.
     ///
     /// # Errors
     /// There is no such collection.
@@ -39,7 +38,7 @@ impl Library {
         self.shapes_reviewed(collection, (after_ordinal, limit), label, None)
     }
 
-    /// As [`Library::shapes`]; with `review`, only those with this verdict.
+    /// Does what [`Library::shapes`] does; with `review`, returns only shapes with this verdict.
     ///
     /// # Errors
     /// There is no such collection.
@@ -74,7 +73,7 @@ impl Library {
         })
     }
 
-    /// One shape.
+    /// Returns one shape.
     ///
     /// # Errors
     /// There is no such collection or shape.
@@ -87,7 +86,7 @@ impl Library {
         })
     }
 
-    /// The newest labels of a shape, or those of `version`.
+    /// Returns the newest labels of a shape, or those of `version`.
     ///
     /// # Errors
     /// There is no such shape, or the version is not (or no longer) stored.
@@ -105,7 +104,7 @@ impl Library {
             .ok_or_else(|| LibraryError::not_found(Named::Version, name()))
     }
 
-    /// The bytes of a shape as they were sent, and their format.
+    /// Returns the bytes of a shape as they were sent, and their format.
     ///
     /// # Errors
     /// There is no such shape, or its file is damaged.
@@ -115,7 +114,7 @@ impl Library {
         Ok((self.store.original(&row.content_digest)?, format))
     }
 
-    /// Bytes of the file of a shape, for whoever plans its memory.
+    /// Returns the number of bytes of the file of a shape, from which its memory can be planned.
     ///
     /// # Errors
     /// There is no such shape, or the catalog cannot be read.
@@ -124,7 +123,8 @@ impl Library {
         object_length(&self.store, &row.content_digest)
     }
 
-    /// Eigenvalues, eigenvectors, HKS, descriptors of a shape: mapped, not copied.
+    /// Maps the eigenvalues, eigenvectors, HKS and descriptors of a shape into memory, without a
+    /// copy.
     ///
     /// # Errors
     /// There is no such shape, or its file is damaged.
@@ -133,8 +133,8 @@ impl Library {
         Ok(mapped_shape(&self.store, row.id)?.1)
     }
 
-    /// The arrays of [`Library::description`], with the newest label of each proxy face (-1:
-    /// unlabelled) and their version, as of one moment.
+    /// Returns the arrays of [`Library::description`], with the newest label of each proxy face
+    /// (-1: unlabelled) and their version, as of one moment.
     ///
     /// # Errors
     /// There is no such shape, or its file is damaged.
@@ -148,8 +148,8 @@ impl Library {
         Ok((mapped, labels.proxy_labels, labels.version))
     }
 
-    /// The functional map that carries functions on `from` to `to`: the stored one, or else computed
-    /// now.
+    /// Returns the functional map that carries functions on `from` to `to`. Computes it if it is
+    /// not stored.
     ///
     /// # Errors
     /// There is no such shape, or the collection has no label model yet.
@@ -175,7 +175,7 @@ impl Library {
         })
     }
 
-    /// The map that [`Library::map`] returns if it is stored: nothing is computed.
+    /// Returns the map that [`Library::map`] returns, if it is stored. Computes nothing.
     ///
     /// # Errors
     /// There is no such shape, or the map is damaged.
@@ -200,7 +200,7 @@ impl Library {
         }))
     }
 
-    /// Vertices of a shape's proxy.
+    /// Returns the number of vertices of a shape's proxy.
     ///
     /// # Errors
     /// There is no such shape, or its description is damaged.
@@ -209,11 +209,11 @@ impl Library {
         Ok(self.store.known(row.id)?.view().vertices.len())
     }
 
-    /// Which part of A matches which part of B under the map from A to B, by descending overlap,
-    /// and how good the map is. Parts are numbered as in [`ShapeInfo::parts`].
+    /// Returns which part of A matches which part of B under the map from A to B, by descending
+    /// overlap, and the quality of the map. Parts are numbered as in [`ShapeInfo::parts`].
     ///
     /// # Errors
-    /// As [`Library::map`].
+    /// Those of [`Library::map`].
     pub fn part_correspondence(
         &self,
         collection: &str,
@@ -245,8 +245,8 @@ impl Library {
         Ok((matches, map.quality))
     }
 
-    /// The `limit` shapes nearest to a shape by global descriptor, with their distances, nearest
-    /// first.
+    /// Returns the `limit` shapes nearest to a shape by global descriptor, with their distances,
+    /// nearest first.
     ///
     /// # Errors
     /// There is no such collection or shape.
@@ -279,7 +279,7 @@ impl Library {
         })
     }
 
-    /// Labels of every shape and the collection's sequence, as of one moment.
+    /// Returns the labels of every shape and the collection's sequence number, as of one moment.
     ///
     /// # Errors
     /// There is no such collection.
@@ -296,7 +296,7 @@ impl Library {
         })
     }
 
-    /// Events of a collection after `sequence`, oldest first, at most `limit`.
+    /// Returns events of a collection after `sequence`, oldest first, at most `limit`.
     ///
     /// # Errors
     /// The catalog cannot be read. A name that never was a collection has no events.
@@ -321,7 +321,7 @@ impl Library {
         })
     }
 
-    /// Counters for the operator.
+    /// Returns counters for the operator.
     ///
     /// # Errors
     /// The catalog cannot be read.

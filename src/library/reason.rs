@@ -1,9 +1,9 @@
-//! The codes and reasons of failures. Their names are those of the wire, and are stored with failed
-//! shapes.
+//! Defines the codes and reasons of failures. Their names are those on the wire, and are stored
+//! with failed shapes.
 
 use serde::{Deserialize, Serialize};
 
-/// An enum whose variants have names that are stored and sent.
+/// Defines an enum whose variants have names that are stored and sent.
 macro_rules! named {
     ($(#[$meta:meta])* $type:ident { $($variant:ident = $name:literal),+ $(,)? }) => {
         $(#[$meta])*
@@ -17,10 +17,10 @@ macro_rules! named {
         }
 
         impl $type {
-            /// All that have a name.
+            /// All variants that have a name.
             pub const ALL: &[Self] = &[$(Self::$variant),+];
 
-            /// The stored name.
+            /// Returns the stored name.
             pub fn name(self) -> &'static str {
                 match self {
                     $(Self::$variant => $name,)+
@@ -38,7 +38,7 @@ macro_rules! named {
 }
 
 named!(
-    /// What kind of failure it is.
+    /// The kind of a failure.
     Code {
         AlreadyExists = "ALREADY_EXISTS",
         Cancelled = "CANCELLED",

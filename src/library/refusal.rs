@@ -1,4 +1,4 @@
-//! Errors become the failure of one shape.
+//! Converts errors to the failure of one shape.
 
 use super::error::LibraryError;
 use super::reason::{Code, Reason};
@@ -7,7 +7,8 @@ use crate::mesh::{CleanError, ParseError};
 use crate::pipeline::DescribeError;
 use crate::spectrum::SpectrumError;
 
-/// An error of the library as the failure of an item: what it needed is gone, if it is not there.
+/// Converts an error of the library to the failure of an item. If something is not found, it was
+/// removed after the item was accepted.
 pub(super) fn failure(error: &LibraryError) -> Failure {
     let failure = Failure::from(error);
     match error {
@@ -19,7 +20,7 @@ pub(super) fn failure(error: &LibraryError) -> Failure {
     }
 }
 
-/// Why a mesh could not be described, as the failure of an item.
+/// Converts the error of a description to the failure of an item.
 pub(super) fn refusal(error: &DescribeError) -> Failure {
     let (code, reason) = match error {
         DescribeError::Parse(e) => (Code::InvalidArgument, parse_reason(e)),
@@ -55,7 +56,7 @@ fn parse_reason(error: &ParseError) -> Reason {
     }
 }
 
-/// Where in the file, if it is one place.
+/// Returns the location in the file, if there is one.
 fn parse_subject(error: &ParseError) -> Option<FailureSubject> {
     match error {
         ParseError::NotANumber { line, .. }

@@ -1,4 +1,4 @@
-//! Keeps the parts of shapes that were asked about lately in memory.
+//! Remembers the parts of shapes about which a person was asked recently.
 
 use super::error::Result;
 use super::sources::Sources;
@@ -7,18 +7,18 @@ use crate::store::ShapeId;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Shapes whose parts are remembered: about 30 KB each.
+/// Maximum number of shapes whose parts are remembered, about 30 KB each.
 const MAX_REMEMBERED: usize = 512;
 
-/// A shape and the bits of the up axis along which its parts were made.
+/// A shape, and the bits of the up axis along which it was divided.
 type PartsKey = (ShapeId, [u64; 3]);
 
-/// The parts of shapes that were asked about lately, so that the next question is quick.
+/// The parts of shapes about which a person was asked recently, so that the next question is quick.
 #[derive(Debug, Default)]
 pub(super) struct RememberedParts(Mutex<HashMap<PartsKey, Arc<ShapeParts>>>);
 
 impl RememberedParts {
-    /// The parts of a shape, computed if they are not remembered.
+    /// Returns the parts of a shape; computes them if they are not remembered.
     pub(super) fn of(
         &self,
         sources: &dyn Sources,

@@ -1,9 +1,9 @@
-//! Placing in another process: the ticket that it gets, and the state that it returns.
+//! Places a shape in another process: defines the ticket that it gets and the state that it
+//! returns.
 //!
-//! The other process opens the library beside the one that holds it, and commits by itself: a
-//! process that dies in the middle leaves what a crash leaves, which is nothing. The holder lends
-//! it the collection for that time, and sees by the collection's row that it must load the
-//! collection again.
+//! The other process opens the library beside the process that holds it, and commits by itself. If
+//! it dies in the middle, the library is as after a crash, without the change. Meanwhile the holder
+//! does not use the collection. It detects by the collection's row that it must reload it.
 
 use super::error::{LibraryError, Result};
 use super::facade::Library;
@@ -17,10 +17,10 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::time::Instant;
 
-/// Where the other process's text came from, in errors.
+/// The origin of the other process's text, in errors.
 const LOCATION: &str = "work handed over";
 
-/// A described shape, on disk, and the item it belongs to.
+/// A described shape on disk, and its item.
 #[derive(Debug, Serialize, Deserialize)]
 struct Ticket {
     job: u64,
@@ -34,11 +34,11 @@ struct Ticket {
     stages_ms: Vec<(String, f64)>,
 }
 
-/// The text that tells another process which shape to place. Its description stays on disk until this
-/// is dropped.
+/// Names the shape that another process is to place. Its description stays on disk until this is
+/// dropped.
 #[derive(Debug)]
 pub struct PlacementTicket {
-    /// For [`Library::place_ticket`].
+    /// The argument of [`Library::place_ticket`].
     pub words: Value,
     _kept: Kept,
 }
@@ -71,8 +71,9 @@ impl Ticket {
 }
 
 impl Library {
-    /// Opens the library in `dir` beside the process that holds it: the one that started this
-    /// process, and that lends it ([`Library::with_exclusive`]) each collection it is to change.
+    /// Opens the library in `dir` beside the process that holds it. That process has started this
+    /// one, and gives it exclusive use ([`Library::with_exclusive`]) of each collection that it is
+    /// to change.
     ///
     /// # Errors
     /// There is no library of this version's format, or it cannot be read.
@@ -80,8 +81,8 @@ impl Library {
         Ok(Self::over(Store::open_beside(dir)?))
     }
 
-    /// Makes a description durable, for [`Library::place_ticket`] in another process, which is to
-    /// end before what this returns is dropped.
+    /// Makes a description durable for [`Library::place_ticket`] in another process. That process
+    /// must end before the returned ticket is dropped.
     ///
     /// # Errors
     /// The description cannot be stored.
@@ -116,10 +117,10 @@ impl Library {
         })
     }
 
-    /// [`Library::place_item`] of the description that a ticket names.
+    /// Does what [`Library::place_item`] does with the description that a ticket names.
     ///
     /// # Errors
-    /// As for [`Library::place_item`]; the description cannot be read.
+    /// Those of [`Library::place_item`]; or the description cannot be read.
     pub fn place_ticket(&self, ticket: &Value) -> Result<ItemState> {
         let ticket: Ticket = from_json(&ticket.to_string(), LOCATION)?;
         let object = ticket.object()?;
@@ -134,7 +135,7 @@ impl Library {
         self.place_item(&ticket.item(), Ok(described))
     }
 
-    /// The bytes of the mesh file of the shape that a ticket names.
+    /// Returns the bytes of the mesh file of the shape that a ticket names.
     ///
     /// # Errors
     /// There is no such item, or its bytes cannot be read.
@@ -144,7 +145,7 @@ impl Library {
         self.store.original(&row.item.original_digest)
     }
 
-    /// Whether a shape of a collection is stale.
+    /// Returns whether a shape of a collection is stale.
     ///
     /// # Errors
     /// There is no such collection.
@@ -157,8 +158,8 @@ impl Library {
         Ok(next.is_some())
     }
 
-    /// The state of an item in the catalog. If it is done, the counters include what another process
-    /// did for it.
+    /// Returns the state of an item in the catalog. If it is done, the counters include the work of
+    /// another process for it.
     ///
     /// # Errors
     /// There is no such item.
@@ -171,7 +172,7 @@ impl Library {
     }
 }
 
-/// The state of an item that is over, for another process.
+/// Encodes the state of a finished item for another process.
 pub fn state_to_json(state: &ItemState) -> Value {
     let value = |text: String| serde_json::from_str::<Value>(&text).unwrap_or_default();
     match state {
@@ -182,10 +183,10 @@ pub fn state_to_json(state: &ItemState) -> Value {
     }
 }
 
-/// The state that [`state_to_json`] wrote.
+/// Decodes the state that [`state_to_json`] encoded.
 ///
 /// # Errors
-/// The value is not what [`state_to_json`] makes.
+/// The value is not such a state.
 pub fn state_from_json(value: &Value) -> Result<ItemState> {
     let other = || damaged(LOCATION, &format!("{value} is no state"));
     if let Some(word) = value.as_str() {
@@ -213,7 +214,7 @@ mod tests {
     const TETRAHEDRON: &str =
         "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n";
 
-    /// A state without times, which lose their last bit on the way through JSON.
+    /// Removes the times of a state, which lose their last bit in JSON.
     fn untimed(state: ItemState) -> ItemState {
         match state {
             ItemState::Done(mut placed) => {
@@ -224,7 +225,7 @@ mod tests {
         }
     }
 
-    /// Two libraries over one folder stand for two processes.
+    /// Two libraries over one folder represent two processes.
     #[test]
     fn what_is_placed_beside_is_what_the_holder_would_have_placed() {
         let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
@@ -258,7 +259,7 @@ mod tests {
                 let described = holder.describe_item(&job.items[0], &|_| true).unwrap();
                 (job, described)
             });
-            // The holder uses the collection in between, as corrections do.
+            // In between, the holder uses the collection, as corrections do.
             holders[0]
                 .name_label("c", 0, &format!("part {n}"), None)
                 .ok();

@@ -1,4 +1,4 @@
-//! A shape is removed.
+//! Removes shapes.
 
 use super::change::{Change, LabelEdit, commit_once};
 use super::collection::{Collection, Staleness, discovered, supervised};
@@ -11,8 +11,8 @@ use super::types::RequestKey;
 use crate::store::ShapeRow;
 
 impl Library {
-    /// Removes a shape with its labels and maps, and takes its statistics out of the label model.
-    /// Labels of other shapes stay as they are, unless the shape was a training shape.
+    /// Removes a shape with its labels and maps, and subtracts its statistics from the label model.
+    /// Labels of other shapes stay, unless the shape was a training shape.
     ///
     /// # Errors
     /// There is no such shape.

@@ -1,8 +1,8 @@
-//! Recomputes from the stored mesh what is damaged and can be recomputed.
+//! Recomputes damaged data from the stored meshes, where that is possible.
 //!
-//! The bytes that a person sent, labels, corrections and events cannot be computed: where one of
-//! these is damaged the repair says so, and a snapshot is needed. Descriptions, signatures, maps
-//! and indexes can.
+//! Descriptions, signatures, maps and indexes can be recomputed. The original bytes, labels,
+//! corrections and events cannot: where one of these is damaged, the repair reports it, and a
+//! snapshot is needed.
 
 use super::error::{LibraryError, Result};
 use super::facade::Library;
@@ -17,18 +17,18 @@ use crate::store::{CollectionRow, Digest, ObjectKind, ShapeRow};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// What a repair did.
+/// The result of a repair.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Repaired {
-    /// What was mended, and what could not be, in words.
+    /// Lines of text about what was repaired, and what could not be.
     pub done: Vec<String>,
-    /// What a check found afterwards.
+    /// Findings of a check after the repair.
     pub left: Vec<Finding>,
 }
 
 impl Library {
-    /// Mends what can be mended of the library in `dir`, which no process may hold. Damaged files
-    /// are put into `quarantine/`.
+    /// Repairs the library in `dir` as far as possible. No process may hold it. Damaged files are
+    /// moved to `quarantine/`.
     ///
     /// # Errors
     /// The library is held, or so damaged that it cannot be opened.
@@ -41,11 +41,12 @@ impl Library {
         }
         let library = Self::open(dir)?;
         if lost.is_some() {
-            // The sweep would take them for what an addition left that was never accepted.
+            // The sweep would treat them as files of an addition that was never accepted.
             for file in library.store.uncatalogued_originals()? {
                 library.store.put_aside(&file)?;
                 done.push(format!(
-                    "{file}: a mesh that no row names was put into quarantine/: it can be added again"
+                    "{file}: a mesh that no row names was put into quarantine/: it \
+                     can be added again"
                 ));
             }
         }
@@ -62,7 +63,7 @@ impl Library {
             match library.repair_shape(collection, shape) {
                 Ok(what) => done.extend(what),
                 Err(e) => done.push(format!(
-                    "{}/{}: not mended: {e}",
+                    "{}/{}: not repaired: {e}",
                     collection.name, shape.name
                 )),
             }
@@ -72,7 +73,7 @@ impl Library {
         for name in collections {
             match library.mend_maps(name) {
                 Ok(mended) => done.extend(mended.into_iter().map(|m| format!("{name}: {m}"))),
-                Err(e) => done.push(format!("{name}: maps not mended: {e}")),
+                Err(e) => done.push(format!("{name}: maps not recomputed: {e}")),
             }
         }
         drop(library);
@@ -82,7 +83,7 @@ impl Library {
         })
     }
 
-    /// The description and the signature of one shape.
+    /// Recomputes the description and the signature of one shape.
     fn repair_shape(&self, collection: &CollectionRow, shape: &ShapeRow) -> Result<Vec<String>> {
         let mut done = Vec::new();
         let location = format!("{}/{}", collection.name, shape.name);
@@ -123,7 +124,7 @@ impl Library {
                 self.store
                     .catalog()
                     .write(|tx| -> Result<()> { Ok(tx.insert_object(&again)?) })?;
-                done.push(format!("{location}: {} was computed again", again.file));
+                done.push(format!("{location}: {} was recomputed", again.file));
                 self.store.objects().open_description(&again)?
             }
             Err(e) => return Err(e.into()),
@@ -144,7 +145,7 @@ impl Library {
         Ok(done)
     }
 
-    /// Maps whose rows are damaged: they are computed again when they are asked for.
+    /// Deletes maps with damaged rows. They are computed again when they are requested.
     fn drop_bad_maps(&self) -> Result<Vec<String>> {
         let catalog = self.store.catalog();
         let keys = catalog.read(|r| -> Result<_> { Ok(r.map_keys()?) })?;
@@ -153,7 +154,9 @@ impl Library {
             match catalog.read(|r| -> Result<_> { Ok(r.map(from, to)?) }) {
                 Err(LibraryError::Store(e)) if e.is_damage() => {
                     catalog.write(|tx| -> Result<()> { Ok(tx.delete_map(from, to)?) })?;
-                    done.push(format!("maps {from}, {to}: was forgotten"));
+                    done.push(format!(
+                        "maps {from}, {to}: was deleted, because its row was damaged"
+                    ));
                 }
                 _ => {}
             }
@@ -166,7 +169,9 @@ impl Library {
                     catalog.write(|tx| -> Result<()> {
                         Ok(tx.delete_point_maps(from, to, &request)?)
                     })?;
-                    done.push(format!("point_maps {from}, {to}: were forgotten"));
+                    done.push(format!(
+                        "point_maps {from}, {to}: were deleted, because their row was damaged"
+                    ));
                 }
                 _ => {}
             }

@@ -12,11 +12,11 @@ use super::types::RequestKey;
 use super::verdict::{Review, ReviewState};
 
 impl Library {
-    /// Takes all present labels of a shape as a person's, who found them right: it becomes a
-    /// training shape, from which the labels of other shapes follow in the background.
+    /// Approves a shape: all its present labels count as given by a person, who found them right.
+    /// It becomes a training shape, from which the labels of other shapes follow in the background.
     ///
     /// # Errors
-    /// There is no such collection or shape, or its labels are too many for a person's.
+    /// There is no such collection or shape, or it has more labels than persons can use.
     pub fn approve(
         &self,
         collection: &str,
@@ -44,7 +44,7 @@ impl Library {
         })
     }
 
-    /// Notes that a person found something wrong with the labels of a shape, and left it. No label
+    /// Records that a person found a fault in the labels of a shape without correcting it. No label
     /// changes.
     ///
     /// # Errors

@@ -7,11 +7,11 @@ use super::rows::damaged;
 use super::verdict::{Review, ReviewState};
 use crate::store::ReviewRow;
 
-/// Most bytes of a person's name.
+/// Maximum number of bytes of a person's name.
 const MAX_REVIEWER: usize = 128;
 
-/// The review that a row says, or its absence: before reviews were stored, pins alone said that a
-/// shape was corrected.
+/// Converts a row to a review. Before reviews were stored, pins alone showed that a shape was
+/// corrected.
 pub(super) fn review_of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Review> {
     let Some(row) = row else {
         return Ok(Review {
@@ -32,7 +32,7 @@ pub(super) fn review_of_row(row: Option<ReviewRow>, pinned: bool) -> Result<Revi
     })
 }
 
-/// Refuses what cannot be a person's name. It may be empty.
+/// Refuses a name that is not valid for a person. It may be empty.
 pub(super) fn check_reviewer(by: &str) -> Result<()> {
     match by {
         "" => Ok(()),
@@ -40,7 +40,7 @@ pub(super) fn check_reviewer(by: &str) -> Result<()> {
     }
 }
 
-/// A verdict that is given now.
+/// Makes the row of a new verdict.
 pub(super) fn review_row(state: ReviewState, by: &str) -> ReviewRow {
     ReviewRow {
         state: state.name().to_owned(),

@@ -1,4 +1,4 @@
-//! Text in the catalog becomes domain values and back.
+//! Converts text in the catalog to domain values and back.
 
 use super::error::{LibraryError, Result};
 use crate::fmap::{Confidence, Quality, confidence};
@@ -16,7 +16,7 @@ pub(super) fn from_json<'a, T: Deserialize<'a>>(text: &'a str, location: &str) -
     serde_json::from_str(text).map_err(|e| damaged(location, &e.to_string()))
 }
 
-/// A row of the catalog that does not hold what was written.
+/// Makes the error for a row of the catalog with content that was never written.
 pub(super) fn damaged(location: &str, message: &str) -> LibraryError {
     StoreError::Damaged {
         path: location.to_string(),
@@ -25,7 +25,7 @@ pub(super) fn damaged(location: &str, message: &str) -> LibraryError {
     .into()
 }
 
-/// A clean report as JSON.
+/// Converts a report of cleaning to JSON.
 pub fn report_to_json(report: &CleanReport) -> Value {
     Value::Object(
         report
@@ -83,18 +83,18 @@ pub(super) fn quality_from_json(text: &str, location: &str) -> Result<Quality> {
         quality.confidence = number("confidence")?;
         quality.matched = number("matched")?;
     } else {
-        // Kept before these were known: a typical return, so that the residual and the rest decide.
+        // Stored before these were computed: a typical return lets the residual and the other terms
+        // decide.
         quality.descriptor_return = TYPICAL_RETURN;
         quality.confidence = confidence::of_map(&quality);
     }
     Ok(quality)
 }
 
-/// Mean squared difference of descriptors between a vertex and what its match is matched with, of
-/// an ordinary map.
+/// Typical mean squared difference of descriptors between a vertex and the match of its match.
 const TYPICAL_RETURN: f64 = 0.5;
 
-/// What to expect of a kept map at each vertex.
+/// Returns the expected correctness of a stored map at each vertex.
 pub(super) fn confidence_of_row(row: &MapRow) -> Result<Confidence> {
     if row.confidence.is_empty() {
         let location = format!("maps {} {}", row.from, row.to);
@@ -106,7 +106,7 @@ pub(super) fn confidence_of_row(row: &MapRow) -> Result<Confidence> {
     })
 }
 
-/// The stored word of an operator.
+/// Returns the stored name of an operator.
 pub(super) fn operator_name(operator: Operator) -> &'static str {
     match operator {
         Operator::Tufted => "tufted",
@@ -121,14 +121,14 @@ pub(super) fn operator_from_name(name: &str, location: &str) -> Result<Operator>
     found.ok_or_else(|| damaged(location, &format!("no operator is named {name:?}")))
 }
 
-/// The format of that stored word.
+/// Returns the format of a stored name.
 pub(super) fn format_from_name(name: &str, location: &str) -> Result<Format> {
     let found = Format::ALL.into_iter().find(|f| f.name() == name);
     found.ok_or_else(|| damaged(location, &format!("no format is named {name:?}")))
 }
 
-/// Colours of labels, by id: Okabe and Ito's eight, which colour-blind people can tell apart, then
-/// golden-angle hues.
+/// Returns the colour of a label by its id: the eight colours of Okabe and Ito, which colour-blind
+/// people can distinguish, then golden-angle hues.
 pub(super) fn label_colour(id: u32) -> [u8; 3] {
     const OKABE_ITO: [[u8; 3]; 8] = [
         [230, 159, 0],

@@ -1,4 +1,4 @@
-//! What is read of stored shapes in order to label others: from a store, or from memory in a test.
+//! Reads the stored shapes from which others are labelled: from a store, or from memory in a test.
 
 use super::error::{LibraryError, Result};
 use super::rows::damaged;
@@ -156,7 +156,7 @@ impl Sources for Store {
     }
 }
 
-/// A shape with its mapped arrays and newest labels.
+/// Returns a shape with its mapped arrays and newest labels.
 pub(super) fn mapped_shape(
     store: &Store,
     id: ShapeId,
@@ -165,7 +165,7 @@ pub(super) fn mapped_shape(
     Ok((row, store.objects().open_description(&object)?, labels))
 }
 
-/// The rows of a shape, of its array file and of its newest labels.
+/// Returns the rows of a shape, of its array file and of its newest labels.
 fn labelled_shape(store: &Store, id: ShapeId) -> Result<(ShapeRow, ObjectRow, LabelVersionRow)> {
     let gone = || damaged("shapes", &format!("newest labels of row {id} is gone"));
     store.catalog().read(|r| {
@@ -175,7 +175,7 @@ fn labelled_shape(store: &Store, id: ShapeId) -> Result<(ShapeRow, ObjectRow, La
     })
 }
 
-/// The rows of a shape and of its array file.
+/// Returns the rows of a shape and of its array file.
 fn described_shape(reader: &Reader<'_>, id: ShapeId) -> Result<(ShapeRow, ObjectRow)> {
     let gone = |what: &str| damaged("shapes", &format!("{what} of row {id} is gone"));
     let row = reader.shape(id)?.ok_or_else(|| gone("name"))?;
@@ -191,7 +191,7 @@ fn array_file(store: &Store, object: &ObjectRow) -> Result<ArrayFile> {
     })
 }
 
-/// The row of an object file that must be there.
+/// Returns the row of an object file that must exist.
 pub(super) fn object(store: &Store, kind: ObjectKind, digest: &Digest) -> Result<ObjectRow> {
     let catalog = store.catalog();
     let row = catalog.read(|r| r.object(kind, digest).map_err(LibraryError::from))?;

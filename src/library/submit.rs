@@ -1,4 +1,4 @@
-//! Shapes are accepted and described.
+//! Accepts shapes and describes them.
 
 use super::error::Result;
 use super::facade::Library;
@@ -17,11 +17,11 @@ use std::cell::RefCell;
 use std::sync::PoisonError;
 use std::time::Instant;
 
-/// How the work on one shape is done: here, or in another process.
+/// Describes one shape, in this process or in another one.
 pub type Describer<'a> =
     dyn Fn(&isolate::DescribeJob<'_>, &dyn Fn(&str) -> bool) -> isolate::Described + 'a;
 
-/// A description with what the library needs to commit it.
+/// A description with the values that the library needs to commit it.
 #[derive(Debug, Clone)]
 pub struct Described {
     /// What was computed.
@@ -30,11 +30,11 @@ pub struct Described {
     pub stages_ms: Vec<(String, f64)>,
     pub(super) digest: Digest,
     pub(super) params_json: String,
-    /// Its file, if it is stored already.
+    /// The object of its file, if it is already stored.
     pub(super) stored: Option<ObjectRow>,
 }
 
-/// Shapes whose files are durable, and that count once they are submitted.
+/// Shapes whose files are durable. They become part of a collection once they are submitted.
 #[derive(Debug, Default)]
 pub struct StoredOriginals {
     objects: Vec<Kept>,
@@ -42,7 +42,7 @@ pub struct StoredOriginals {
 }
 
 impl StoredOriginals {
-    /// No shapes yet; [`Library::store_another_original`] adds one after the other.
+    /// Begins without shapes; [`Library::store_another_original`] adds them one by one.
     pub fn new() -> Self {
         Self::default()
     }
@@ -51,11 +51,11 @@ impl StoredOriginals {
 /// Shapes that a request adds to a collection.
 #[derive(Debug, Clone, Copy)]
 pub struct Submission<'a> {
-    /// Where they are added.
+    /// The collection to which they are added.
     pub collection: &'a str,
     /// The shapes.
     pub shapes: &'a StoredOriginals,
-    /// Whose request it is.
+    /// Key of the request, if it has one.
     pub key: Option<&'a RequestKey>,
 }
 
@@ -76,11 +76,11 @@ impl Submission<'_> {
 }
 
 impl Library {
-    /// Writes the files of shapes, durably, for [`Library::submit`] to accept. Several threads may
-    /// do so at a time.
+    /// Makes the files of shapes durable, so that [`Library::submit`] can accept them. Several
+    /// threads may do so at a time.
     ///
     /// # Errors
-    /// A bad name; the disk.
+    /// A name is not valid, or the disk fails.
     pub fn store_originals(&self, shapes: Vec<NewShape>) -> Result<StoredOriginals> {
         for s in &shapes {
             check_shape_name(&s.name)?;
@@ -92,11 +92,11 @@ impl Library {
         Ok(kept)
     }
 
-    /// Writes the file of one more shape, as [`Library::store_originals`] does, so that they need not be in
-    /// memory together.
+    /// Makes the file of one more shape durable, as [`Library::store_originals`] does, so that they
+    /// need not be in memory together.
     ///
     /// # Errors
-    /// A bad name; the disk.
+    /// A name is not valid, or the disk fails.
     pub fn store_another_original(
         &self,
         kept: &mut StoredOriginals,
@@ -114,11 +114,11 @@ impl Library {
         Ok(())
     }
 
-    /// Accepts shapes: when this returns a job with them is durable. The same key gives the same
-    /// job again.
+    /// Accepts shapes. When this returns, a job with them is durable. A repeated request with the
+    /// same key returns the same job.
     ///
     /// # Errors
-    /// No such collection, or a key that was used for another request.
+    /// There is no such collection, or the key was used for another request.
     pub fn submit(
         &self,
         collection: &str,
@@ -134,11 +134,11 @@ impl Library {
         jobs.into_iter().next().expect("invariant: a job for each")
     }
 
-    /// Accepts shapes of several requests in the order given, in one transaction: a job for each,
-    /// which is durable even if it cannot be read back, or none of them.
+    /// Accepts shapes of several requests in the given order, in one transaction: either a job for
+    /// each, which is durable even if it cannot be read back, or none of them.
     ///
     /// # Errors
-    /// As [`Library::submit`], of the first that has one; then nothing is accepted.
+    /// Those of [`Library::submit`], for the first request that has one; then nothing is accepted.
     pub fn submit_together(&self, submissions: &[Submission<'_>]) -> Result<Vec<Result<Job>>> {
         for submission in submissions {
             self.collection_row(submission.collection)?;
@@ -162,7 +162,7 @@ impl Library {
         Ok(replies.into_iter().map(job).collect())
     }
 
-    /// Bytes of an item's file, for whoever plans its memory.
+    /// Returns the number of bytes of an item's file, from which its memory can be planned.
     ///
     /// # Errors
     /// There is no such item, or the catalog cannot be read.
@@ -170,10 +170,10 @@ impl Library {
         object_length(&self.store, &self.item_row(item)?.item.original_digest)
     }
 
-    /// Whether placing an item would need its description now: not when the same bytes are there
-    /// under its name, or others that it may not replace. Either may change until the items before
-    /// it are placed. Bytes that the first release read are described again when they are to
-    /// replace themselves: it may have read them in another way.
+    /// Returns whether placing an item would need its description now. It would not if the same
+    /// bytes are stored under its name, or others that it may not replace. Either may change until
+    /// the items before it are placed. Bytes that the first release read are described again when
+    /// they are to replace themselves, because it may have read them in another way.
     ///
     /// # Errors
     /// There is no such item or collection, or the catalog cannot be read.
@@ -191,11 +191,11 @@ impl Library {
         Ok(row.status == ItemStatus::Queued && existing.is_none_or(replaced))
     }
 
-    /// The pure stage of an item, on any thread. `stage` is told each stage's name as it begins;
-    /// when it returns false the work stops.
+    /// Runs the pure stage of an item, on any thread. Calls `stage` with the name of each stage as
+    /// it begins, and stops when it returns false.
     ///
     /// # Errors
-    /// Why the shape is refused, or why it was stopped.
+    /// The shape is refused, or the work was stopped.
     pub fn describe_item(
         &self,
         item: &JobItem,
@@ -204,10 +204,10 @@ impl Library {
         self.describe_item_by(item, stage, &|job, stage| job.run(stage))
     }
 
-    /// The same, done by `describer`, perhaps in another process.
+    /// Does the same with `describer`, which may use another process.
     ///
     /// # Errors
-    /// Why the shape is refused, or why it was stopped.
+    /// The shape is refused, or the work was stopped.
     pub fn describe_item_by(
         &self,
         item: &JobItem,
@@ -223,8 +223,8 @@ impl Library {
         described
     }
 
-    /// What describing an item needs: its bytes, how to read them, the parameters and their name,
-    /// and the digest of the bytes.
+    /// Returns what the description of an item needs: its bytes, their format, the parameters and
+    /// their text, and the digest of the bytes.
     fn to_describe(&self, item: &JobItem) -> Result<(Vec<u8>, Format, Params, String, Digest)> {
         let row = self.item_row(item)?;
         let collection = self.collection_row(&item.collection)?;
@@ -282,9 +282,9 @@ impl Library {
     }
 }
 
-/// Everything that decides the bits of a description besides bytes and parameters: the algorithm, the
-/// instruction set that the kernels choose at run time, and, where it matters, how the bytes are
-/// read.
+/// Returns everything that decides the bits of a description besides bytes and parameters: the
+/// algorithm, the instruction set that the kernels choose at run time and, where it matters, how
+/// the bytes are read.
 pub(super) fn algorithm(report: &CleanReport) -> String {
     let algorithm = format!("{ALGORITHM_VERSION} {:?}", pulp::Arch::new());
     match report.differs_from_first_release() {
@@ -293,12 +293,12 @@ pub(super) fn algorithm(report: &CleanReport) -> String {
     }
 }
 
-/// Whether a shape was described by the first release, whose reports lack the later counts.
+/// Returns whether the first release described a shape: its reports lack the later counts.
 pub(super) fn read_by_first_release(shape: &ShapeRow) -> bool {
     !shape.report_json.contains("n_concave_polygons")
 }
 
-/// The parameters of a collection's descriptions, and the text that names them.
+/// Returns the parameters of a collection's descriptions, and the text that identifies them.
 pub(super) fn params_of(row: &CollectionRow) -> Result<(Params, String)> {
     let operator = operator_from_name(&row.operator, &format!("collections {}", row.name))?;
     let params = Params {

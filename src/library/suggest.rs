@@ -1,5 +1,5 @@
-//! Suggests the shape to label next: one whose labels would be propagated to many shapes that need
-//! them.
+//! Suggests the shape to label next: one from which labels would be propagated to many uncertain
+//! shapes.
 
 use super::error::{LibraryError, Result};
 use super::facade::Library;
@@ -8,10 +8,10 @@ use super::rows::{damaged, from_json};
 use super::types::PartInfo;
 use crate::neighbors::SignatureMetric;
 
-/// Most shapes that are compared with each other; more are thinned out evenly over the order of
-/// arrival.
+/// Maximum number of shapes that are compared with each other. From more, a sample is taken evenly
+/// over the order of arrival.
 const MAX_COMPARED: usize = 1_000;
-/// Weight of a shape with certain labels: labels may be wrong in spite of that.
+/// Weight of a shape with certain labels, because certain labels may be wrong.
 const LEAST_NEED: f64 = 0.1;
 
 /// The shape whose labelling by a person would help most.
@@ -23,22 +23,22 @@ pub struct Suggestion {
     pub gain: f64,
     /// Share of its area whose label is uncertain.
     pub uncertainty: f64,
-    /// Shapes to which it would be nearer than any that a person labelled.
+    /// Number of shapes to which it would be nearer than any training shape.
     pub n_nearest: u64,
-    /// Why, for people.
+    /// The reason, for people.
     pub reason: String,
-    /// Shapes that a person labelled.
+    /// Number of shapes that a person labelled.
     pub n_corrected: u64,
 }
 
 impl Library {
-    /// The shape whose labelling by a person would help most: that brings the shapes of the
-    /// collection, each as far as its labels are uncertain, nearest to one that a person labelled
-    /// (greedy facility location; Nemhauser, Wolsey and Fisher 1978). With nothing labelled that is
-    /// the medoid. Costs a comparison of at most a thousand signatures with each other.
+    /// Returns the shape whose labelling by a person would help most: the one that brings the other
+    /// shapes, each weighted by the uncertainty of its labels, nearest to a training shape (greedy
+    /// facility location; Nemhauser, Wolsey and Fisher 1978). Without training shapes it is the
+    /// medoid. Compares at most a thousand signatures with each other.
     ///
     /// # Errors
-    /// There is no such collection, or every shape of it was labelled by a person.
+    /// There is no such collection, or a person has labelled every shape of it.
     pub fn suggest(&self, collection: &str) -> Result<Suggestion> {
         let row = self.collection_row(collection)?;
         let (shapes, metric) = self.with_collection(row, |collection| {
@@ -55,7 +55,8 @@ impl Library {
             return Err(LibraryError::FailedPrecondition {
                 reason: Reason::NothingToSuggest,
                 message: format!(
-                    "collection {collection:?} has {} shapes, and a person labelled {n_corrected} of them",
+                    "collection {collection:?} has {} shapes, and a person labelled \
+                     {n_corrected} of them",
                     shapes.len()
                 ),
             });
@@ -104,7 +105,8 @@ impl Library {
             "nothing is labelled by hand yet, and it is the most central shape".to_owned()
         } else {
             format!(
-                "it is nearer to {n_nearest} of {n} shapes than any labelled by hand, and {percent:.0} % of its own area is uncertain"
+                "it is nearer to {n_nearest} of {n} shapes than any labelled by hand, and \
+                 {percent:.0} % of its own area is uncertain"
             )
         };
         Ok(Suggestion {

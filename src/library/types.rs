@@ -6,11 +6,11 @@ use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use serde::{Deserialize, Serialize};
 
-/// The id of a label: parts with the same label correspond across a collection. An id never silently
-/// changes its meaning.
+/// The id of a label: parts with the same label correspond across a collection. An id never
+/// silently changes its meaning.
 pub type LabelId = u32;
 
-/// Which way is up, as a property of a collection.
+/// The up axis of a collection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[allow(missing_docs)]
 pub enum Up {
@@ -38,7 +38,7 @@ impl Up {
         (Self::Auto, "auto"),
     ];
 
-    /// Unit vector in input coordinates; `None` where the axis is not given.
+    /// Returns the unit vector in input coordinates; `None` where the axis is not given.
     pub fn axis(self) -> Option<[f64; 3]> {
         let at = Self::NAMES
             .iter()
@@ -49,7 +49,7 @@ impl Up {
         Some(axis)
     }
 
-    /// The name of a unit vector along an axis; unknown for none.
+    /// Returns the value for a unit vector along an axis; `Unknown` for none.
     pub fn along(axis: Option<[f64; 3]>) -> Self {
         let given = Self::NAMES.iter().map(|n| n.0).take(6);
         axis.and_then(|a| given.clone().find(|up| up.axis() == Some(a)))
@@ -79,25 +79,25 @@ impl std::str::FromStr for Up {
     }
 }
 
-/// What a collection is created with.
+/// The settings with which a collection is created.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct CollectionSpec {
     /// Unique in the library: 1 to 128 characters.
     pub name: String,
     /// Number of part kinds; `None`: estimated.
     pub n_parts: Option<u32>,
-    /// Which way is up.
+    /// The up axis.
     pub up: Up,
-    /// Which Laplacian.
+    /// The Laplacian.
     pub operator: Operator,
-    /// Faces of the working-resolution proxy; 0: the default.
+    /// Number of faces of the working-resolution proxy; 0: the default.
     pub working_faces: u32,
 }
 
-/// A collection as it stands.
+/// The present state of a collection.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CollectionInfo {
-    /// As created.
+    /// The settings with which it was created.
     pub spec: CollectionSpec,
     /// Sequence number of its newest event; 0 before the first.
     pub sequence: u64,
@@ -107,23 +107,21 @@ pub struct CollectionInfo {
     pub n_stale: u64,
     /// Its labels, retired ones included.
     pub labels: Vec<LabelInfo>,
-    /// Where the up axis is estimated, and there are shapes to estimate it from: the estimate in
-    /// force.
+    /// If the up axis is estimated and there are shapes: the estimate in force.
     pub up_estimate: Option<UpEstimate>,
-    /// Where the up axis is given, and at least half of the shapes stand clearly better along one
-    /// other axis: that one.
+    /// If the up axis is given, and at least half of the shapes stand clearly better along one
+    /// other axis: that axis.
     pub up_disagrees: Option<UpEstimate>,
-    /// Changes by a person that can be undone.
+    /// Number of changes by persons that can be undone.
     pub n_undoable: u64,
 }
 
-/// An estimate of which way is up.
+/// An estimate of the up axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpEstimate {
-    /// A coordinate axis; unknown, if fewer than half of the shapes agree on one: then none is
-    /// used.
+    /// A coordinate axis; unknown, and not used, if fewer than half of the shapes agree on one.
     pub up: Up,
-    /// Share of the shapes that stand best along the axis that most do, 0 to 1; by chance a sixth.
+    /// Share of the shapes that stand best along the most common axis, 0 to 1; by chance a sixth.
     pub agreement: f64,
 }
 
@@ -132,13 +130,13 @@ pub struct UpEstimate {
 pub struct LabelInfo {
     /// Its id.
     pub id: LabelId,
-    /// A name a person gave.
+    /// The name that a person gave it.
     pub name: Option<String>,
     /// sRGB colour.
     pub colour: [u8; 3],
     /// The label this one was merged into; `None` while it is in use.
     pub merged_into: Option<LabelId>,
-    /// Shapes that carry it.
+    /// Number of shapes that have it.
     pub n_shapes: u64,
 }
 
@@ -158,13 +156,13 @@ pub struct NewShape {
 /// Names one request of one client, for at least 24 h.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct RequestKey {
-    /// Who asks.
+    /// The client.
     pub client_id: String,
-    /// Which request of theirs.
+    /// The request of this client.
     pub request_id: String,
 }
 
-/// A shape as it stands.
+/// The present state of a shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShapeInfo {
     /// Its name.
@@ -218,7 +216,7 @@ pub struct Source {
 /// Labels of the polygons of the bytes that were sent, in their order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Labels {
-    /// Which version.
+    /// Version of the labels.
     pub version: u64,
     /// `(n_polygons,)`; -1 is unlabelled.
     pub labels: Vec<i32>,
@@ -226,12 +224,12 @@ pub struct Labels {
     pub confidence: Vec<f32>,
 }
 
-/// What became of one shape of a job.
+/// State of one shape of a job.
 #[derive(Debug, Clone, PartialEq)]
 pub enum ItemState {
     /// Not yet begun.
     Queued,
-    /// Being described or placed; the stage by name.
+    /// Being described or placed; with the name of the stage.
     Running(String),
     /// Labelled and durable.
     Done(Box<Placed>),
@@ -241,21 +239,21 @@ pub enum ItemState {
     Cancelled,
 }
 
-/// Why a shape was refused.
+/// The reason why a shape was refused.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
-    /// What kind of failure it is.
+    /// The kind of the failure.
     pub code: Code,
     /// A stable reason within the code.
     pub reason: Reason,
     /// For people: the value and the limit.
     pub message: String,
-    /// Where in the input, if it is one place.
+    /// Location in the input, if there is one.
     #[serde(default)]
     pub subject: Option<FailureSubject>,
 }
 
-/// A place in the input of a shape that was refused.
+/// A location in the input of a shape that was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum FailureSubject {
     /// A face (polygon), from 0.
@@ -269,17 +267,17 @@ pub enum FailureSubject {
 /// One shape of a job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobItem {
-    /// Which job.
+    /// Id of the job.
     pub job: u64,
     /// Position in the job, from 0.
     pub index: u32,
-    /// Which collection.
+    /// Name of the collection.
     pub collection: String,
     /// The shape's name.
     pub name: String,
-    /// What became of it.
+    /// Its state.
     pub state: ItemState,
-    /// How often the work on it ended its process so far, while it is queued.
+    /// Number of times that the work on it ended its process, while it is queued.
     pub attempts: u32,
 }
 
@@ -288,31 +286,31 @@ pub struct JobItem {
 pub struct Job {
     /// Its id.
     pub id: u64,
-    /// Which collection.
+    /// Name of the collection.
     pub collection: String,
     /// Its shapes in order; none if it propagates a correction.
     pub items: Vec<JobItem>,
-    /// How far the correction is propagated, if the job propagates one.
+    /// Progress of the propagation, if the job propagates a correction.
     pub propagation: Option<PropagationProgress>,
 }
 
-/// How far a correction is propagated.
+/// Progress of the propagation of a correction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PropagationProgress {
-    /// Shapes to which it is propagated; 0 once a later change has taken its place.
+    /// Number of shapes to which it is propagated; 0 once a later change has replaced it.
     pub n_shapes: u64,
-    /// Shapes that wait for it.
+    /// Number of shapes that wait for it.
     pub n_left: u64,
 }
 
 impl PropagationProgress {
-    /// Share that is done, 0 to 1.
+    /// Returns the share that is done, 0 to 1.
     pub fn progress(&self) -> f64 {
         1.0 - self.n_left as f64 / self.n_shapes.max(1) as f64
     }
 }
 
-/// What became of an added shape.
+/// Outcome of the addition of a shape.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(missing_docs)]
 pub enum Outcome {
@@ -331,133 +329,15 @@ pub struct Placed {
     pub version: u64,
     /// Sequence number of the collection after the commit.
     pub sequence: u64,
-    /// Functional maps that were computed.
+    /// Number of functional maps that were computed.
     pub n_maps: u32,
-    /// Stored shapes whose labels were recomputed inside this addition.
+    /// Number of stored shapes that this addition relabelled.
     pub n_relabelled: u32,
-    /// Computed maps that do not agree with the maps between the shapes they come from.
+    /// Number of computed maps that do not agree with the maps between the shapes they come from.
     #[serde(default)]
     pub n_inconsistent: u32,
     /// Milliseconds by stage, in order: parse, clean, proxy, laplacian, spectrum, descriptors, ...
     pub stages_ms: Vec<(String, f64)>,
-}
-
-/// Something that happened to a collection.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Event {
-    /// Position in the collection's log, from 1, without gaps.
-    pub sequence: u64,
-    /// What happened.
-    pub kind: EventKind,
-}
-
-/// What can happen to a collection.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub enum EventKind {
-    /// The collection was created.
-    CollectionCreated,
-    /// The collection was deleted with its shapes.
-    CollectionDeleted,
-    /// A labelled shape was added.
-    ShapeAdded {
-        /// Its name.
-        shape: String,
-        /// Version of its labels.
-        version: u64,
-        /// Label and share of the shape's area.
-        area_shares: Vec<(LabelId, f64)>,
-    },
-    /// A shape was removed.
-    ShapeRemoved {
-        /// Its name.
-        shape: String,
-    },
-    /// A stored shape has a new version of its labels.
-    LabelsChanged {
-        /// Its name.
-        shape: String,
-        /// The new version.
-        version: u64,
-        /// The rule that allowed it: `reclustering`, `correction`, `carrying`, `merge`, `split`,
-        /// `undo`.
-        cause: String,
-        /// Share of the shape's area that moved, from label to label (-1: unlabelled).
-        moves: Vec<LabelMove>,
-    },
-    /// A label was created.
-    LabelCreated {
-        /// Its id.
-        label: LabelId,
-    },
-    /// A label turned out to be part of another one; the old id resolves to it.
-    LabelMerged {
-        /// The retired id.
-        from: LabelId,
-        /// The id that stands for both.
-        into: LabelId,
-    },
-    /// A label turned out to be several; the old id keeps the largest share.
-    LabelSplit {
-        /// The id that was split.
-        from: LabelId,
-        /// The new ids.
-        into: Vec<LabelId>,
-    },
-    /// A label was given a name.
-    LabelNamed {
-        /// Which label.
-        label: LabelId,
-        /// The name.
-        name: String,
-    },
-    /// A label went out of use: no shape that a person labelled has it.
-    LabelRetired {
-        /// Its id.
-        label: LabelId,
-    },
-    /// A person labelled faces of a shape; they never change again by themselves.
-    Corrected {
-        /// The shape.
-        shape: String,
-        /// Version of its labels.
-        version: u64,
-        /// Its faces that a person labelled, now or before.
-        n_faces: u64,
-        /// Share of its area that those cover.
-        area_share: f64,
-    },
-    /// The newest change by a person was undone.
-    Undone {
-        /// What it was: `correct`, `name`, `merge`, `split` or `up`.
-        change: String,
-    },
-    /// A person changed which way is up; labels are derived again along the new axis.
-    UpChanged {
-        /// As it was: `+y`, `unknown`, `auto`.
-        from: String,
-        /// As it is.
-        to: String,
-    },
-    /// The parts of the collection were clustered again.
-    Reclustered {
-        /// Score of the labelling before and after; see docs/methods.md.
-        score_before: Option<f64>,
-        /// Score of the new labelling.
-        score_after: f64,
-        /// Whether the new labelling was taken.
-        accepted: bool,
-    },
-}
-
-/// Area that moved from one label to another.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct LabelMove {
-    /// Label before (-1: unlabelled).
-    pub from: i64,
-    /// Label after.
-    pub to: i64,
-    /// Share of the shape's area.
-    pub area_share: f64,
 }
 
 /// A functional map between two shapes of a collection, with its quality.
@@ -471,13 +351,13 @@ pub struct MapInfo {
     pub k1: usize,
     /// `p2p_21 (n2,)`: for each proxy vertex of `to` a proxy vertex of `from`.
     pub p2p_21: Vec<u32>,
-    /// What to expect of it at each proxy vertex of `to`, and where nothing corresponds.
+    /// Expected correctness at each proxy vertex of `to`, and where nothing corresponds.
     pub confidence: crate::fmap::Confidence,
-    /// How good it is.
+    /// Quality of the map.
     pub quality: crate::fmap::Quality,
 }
 
-/// Which part of one shape matches which part of another.
+/// A match between a part of one shape and a part of another.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PartMatch {
     /// Index into the parts of the first shape.
@@ -495,20 +375,20 @@ pub struct PartMatch {
 /// Counters for the operator.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LibraryStats {
-    /// Collections.
+    /// Number of collections.
     pub n_collections: u64,
-    /// Shapes.
+    /// Number of shapes.
     pub n_shapes: u64,
-    /// Job items not yet done.
+    /// Number of job items that are not done.
     pub n_queued: u64,
     /// Stored shapes whose labels wait to be recomputed.
     pub n_stale: u64,
-    /// Bytes of array files and originals.
+    /// Number of bytes of array files and originals.
     pub stored_bytes: u64,
-    /// Bytes of the catalog.
+    /// Number of bytes of the catalog.
     pub catalog_bytes: u64,
-    /// Most stored shapes relabelled by one addition since start.
+    /// Maximum number of stored shapes that one addition relabelled since start.
     pub max_relabelled: u64,
-    /// Most functional maps computed by one addition since start.
+    /// Maximum number of functional maps that one addition computed since start.
     pub max_maps: u64,
 }

@@ -1,9 +1,8 @@
-//! Another up axis for a collection: labels derived along the old one are derived again along the
-//! new one.
+//! Changes the up axis of a collection, and derives its labels again along the new one.
 //!
-//! Descriptions are the same along every axis. Five columns of face descriptors depend on it, and
-//! are computed from descriptions whenever shapes are labelled; so only the label model and the
-//! labels have to follow.
+//! Descriptions do not depend on the axis. Five columns of face descriptors do, and are computed
+//! from descriptions whenever shapes are labelled; so only the label model and the labels must
+//! follow.
 
 use super::advance::relabel_all;
 use super::change::{Change, Undoable, commit_once};
@@ -11,17 +10,18 @@ use super::collection::discovered::{self, MAX_REPRESENTATIVES};
 use super::collection::up::UpFound;
 use super::collection::{Collection, Regime, Staleness, supervised};
 use super::error::Result;
+use super::event::EventKind;
 use super::facade::Library;
 use super::once::{Request, answered, from_reply};
 use super::rows::to_json;
 use super::sources::Sources;
-use super::types::{EventKind, RequestKey, Up};
+use super::types::{RequestKey, Up};
 use serde::{Deserialize, Serialize};
 
-/// What became of a collection whose up axis was set.
+/// The result of setting the up axis of a collection.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct UpSet {
-    /// Whether it was another one before; if not, nothing was done.
+    /// Whether the axis was another one before; if not, nothing was done.
     pub changed: bool,
     /// Stored shapes whose labels wait to be recomputed.
     pub n_stale: u64,
@@ -30,10 +30,10 @@ pub struct UpSet {
 }
 
 impl Library {
-    /// Sets which way is up in a collection. Where nobody has labelled faces its parts are
-    /// clustered again, and the labels that are found along the new axis are taken; otherwise
-    /// pinned faces keep their labels and all others follow from them. Shapes that remain to be
-    /// done are stale afterwards. Can be undone.
+    /// Sets the up axis of a collection. If nobody has labelled faces, its parts are clustered
+    /// again, and the labels that are found along the new axis are accepted. Otherwise pinned faces
+    /// keep their labels, and all others follow from them. Shapes that remain to be relabelled are
+    /// stale afterwards. Can be undone.
     ///
     /// # Errors
     /// There is no such collection, or one of its shapes cannot be read.
@@ -61,7 +61,7 @@ impl Library {
         })
     }
 
-    /// What follows from another up axis.
+    /// Returns the change that follows from another up axis.
     fn turned(&self, collection: &mut Collection, up: Up) -> Result<Change> {
         let found = discovered::up_found(collection, &self.store, up, None)?;
         let in_force = collection.label_model().map(|m| m.up);
@@ -87,9 +87,9 @@ impl Library {
     }
 }
 
-/// What changes where nothing is clustered. `is_same`: labels stay, because there are no shapes, or
-/// the same axis is in force as before; otherwise they follow from the training shapes, once the
-/// model is fitted along the new axis.
+/// Returns the change if nothing is clustered. With `is_same`, labels stay, because there are no
+/// shapes, or the same axis is in force as before. Otherwise labels follow from the training
+/// shapes, once the model is fitted along the new axis.
 fn without_clustering(
     collection: &Collection,
     sources: &dyn Sources,
@@ -98,7 +98,7 @@ fn without_clustering(
 ) -> Result<Change> {
     let mut state = collection.state().clone().with_up(&found);
     if collection.shapes().is_empty() {
-        // The next shape begins again, along the new axis.
+        // The next shape begins the collection again, along the new axis.
         state.next_recluster = 0;
     }
     let mut staleness = Staleness::AsLabelled;
@@ -107,8 +107,8 @@ fn without_clustering(
         false => supervised::refit(collection, sources, None)?,
     };
     if let Some(supervision) = refit {
-        // Labels discovered along the old axis are believed no longer where persons' labels are all
-        // there are.
+        // Where the vocabulary is closed, labels that were discovered along the old axis count no
+        // longer.
         state.regime = Regime::Supervised(match supervision.is_closed() {
             true => supervision.without_discovered(),
             false => supervision,

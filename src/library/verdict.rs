@@ -1,5 +1,4 @@
-//! Defines a person's verdict on a shape: its labels were corrected, are right as they are, or are
-//! doubtful.
+//! Defines a person's verdict on a shape: its labels were corrected, are right, or are doubtful.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,12 +12,12 @@ pub enum ReviewState {
     Corrected,
     /// A person found all its labels right.
     Approved,
-    /// A person found something wrong that is still there.
+    /// A person found a fault that remains.
     Doubtful,
 }
 
 impl ReviewState {
-    /// All of them, in the order in which work proceeds.
+    /// All verdicts, in the order in which work proceeds.
     pub const ALL: [Self; 4] = [
         Self::Unseen,
         Self::Corrected,
@@ -26,7 +25,7 @@ impl ReviewState {
         Self::Doubtful,
     ];
 
-    /// The stored name.
+    /// Returns the stored name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Unseen => "unseen",
@@ -36,7 +35,7 @@ impl ReviewState {
         }
     }
 
-    /// The state of this name.
+    /// Returns the verdict of a name.
     pub fn of_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|s| s.name() == name)
     }
@@ -47,8 +46,8 @@ impl ReviewState {
 pub struct Review {
     /// The verdict.
     pub state: ReviewState,
-    /// Who gave it, as the person said; may be empty.
+    /// The name that the person gave; may be empty.
     pub by: String,
-    /// When, in milliseconds since 1970; 0: unknown.
+    /// The time, in milliseconds since 1970; 0: unknown.
     pub unix_ms: u64,
 }

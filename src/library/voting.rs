@@ -1,4 +1,4 @@
-//! Stored shapes vote for the labels of another one, through functional maps.
+//! Builds the votes of stored shapes for the labels of another one, through functional maps.
 
 use super::collection::Collection;
 use super::error::Result;
@@ -14,7 +14,7 @@ use crate::store::{MapRow, ShapeId};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// A shape with what labelling derives from it under a label model.
+/// A shape with the values that labelling derives from it under a label model.
 #[derive(Debug)]
 pub(super) struct PreparedShape<'a> {
     pub(super) view: DescriptionView<'a>,
@@ -39,8 +39,8 @@ impl<'a> PreparedShape<'a> {
         )
     }
 
-    /// [`Self::map_to`], grown from a given map `c_12 (k, k1)` in place of nearest neighbours of
-    /// descriptors.
+    /// Computes a map like [`Self::map_to`], but starts from a map `c_12 (k, k1)` instead of
+    /// nearest neighbours of descriptors.
     pub(super) fn map_grown_from(
         &self,
         to: &PreparedShape<'_>,
@@ -61,7 +61,7 @@ impl<'a> PreparedShape<'a> {
 pub(super) struct Voted {
     pub(super) labelling: Labelling,
     pub(super) sources: Vec<Source>,
-    /// By the shape that each comes from.
+    /// Each map with the shape that it comes from.
     pub(super) maps: Vec<(ShapeId, FunctionalMap)>,
 }
 
@@ -74,7 +74,8 @@ impl Voted {
         }
     }
 
-    /// The labelling, the shapes that voted, and the maps; none where nothing could vote yet.
+    /// Splits an optional value into the labelling, the shapes that voted, and the maps; none
+    /// without a value.
     pub(super) fn parts(
         voted: Option<Self>,
     ) -> (
@@ -95,18 +96,19 @@ pub(super) struct Voter {
     pub(super) known: Known,
     /// Its label probabilities; `None`: those of its newest labels.
     probabilities: Option<Vec<u8>>,
-    /// Weight of its vote against that of a shape whose labels were propagated.
+    /// Weight of its vote, relative to that of a shape whose labels were propagated.
     trust: f64,
 }
 
 impl Voter {
-    /// A shape that votes with its newest labels. Where those were computed by a model of another
-    /// epoch, whose classes may be others, the labels themselves count instead of probabilities.
+    /// A shape that votes with its newest labels. If a model of another epoch computed them, with
+    /// perhaps other classes, the vote uses the labels themselves instead of probabilities.
     pub(super) fn new(known: Known, model: &LabelModel) -> Self {
         Self::training(known, None, 1.0, model)
     }
 
-    /// A shape that votes with its newest labels or with other probabilities, and is trusted.
+    /// A shape that votes with its newest labels, or with other probabilities, and has the weight
+    /// `trust`.
     pub(super) fn training(
         known: Known,
         probabilities: Option<Vec<u8>>,
@@ -138,7 +140,7 @@ impl Voter {
     }
 }
 
-/// Probabilities `(m, k)` of given classes, and zeros for faces without one.
+/// Returns probabilities `(m, k)` of given classes; zeros for faces without one.
 pub(super) fn one_hot(classes: &[Option<u32>], k: usize) -> Vec<u8> {
     let mut out = vec![0; classes.len() * k];
     for (row, class) in out.chunks_exact_mut(k).zip(classes) {
@@ -149,7 +151,7 @@ pub(super) fn one_hot(classes: &[Option<u32>], k: usize) -> Vec<u8> {
     out
 }
 
-/// What votes need of a map to the shape that is labelled.
+/// The values that votes need of a map to the shape that is labelled.
 #[derive(Debug, Clone)]
 pub(super) struct IncomingMap {
     p2p_21: Vec<u32>,
@@ -164,7 +166,7 @@ impl IncomingMap {
         })
     }
 
-    /// For each vertex of the shape that is labelled a vertex of the voter.
+    /// Returns, for each vertex of the shape that is labelled, a vertex of the voter.
     pub(super) fn p2p_21(&self) -> &[u32] {
         &self.p2p_21
     }
@@ -183,7 +185,7 @@ impl From<&FunctionalMap> for IncomingMap {
     }
 }
 
-/// One vote for each voter and its map.
+/// Makes one vote for each voter and its map.
 pub(super) fn votes<'a>(voters: &'a [Voter], maps: &'a [IncomingMap]) -> Vec<Vote<'a>> {
     let vote = |(voter, map): (&'a Voter, &'a IncomingMap)| Vote {
         faces: voter.known.view().faces,
@@ -198,7 +200,7 @@ pub(super) fn votes<'a>(voters: &'a [Voter], maps: &'a [IncomingMap]) -> Vec<Vot
     voters.iter().zip(maps).map(vote).collect()
 }
 
-/// The voters as the sources of a labelling, with the weights of their votes.
+/// Returns the voters as the sources of a labelling, with the weights of their votes.
 pub(super) fn sources_of(voters: &[Voter], weights: &[f64]) -> Vec<Source> {
     let source = |(voter, weight): (&Voter, &f64)| Source {
         shape: voter.known.row.name.clone(),
@@ -230,8 +232,8 @@ pub(super) fn new_maps(
     maps.collect()
 }
 
-/// The `limit` shapes among some whose maps to a shape promise most, best first: twice as many are
-/// taken by their signatures, and compared vertex by vertex.
+/// Returns, best first, the `limit` shapes among some whose maps to a shape promise most. Twice as
+/// many are selected by their signatures, then compared vertex by vertex.
 pub(super) fn rank_candidates(
     collection: &Collection,
     sources: &dyn Sources,

@@ -1,5 +1,6 @@
-//! While nobody has changed labels: shapes are labelled by the votes of the nearest ones and the
-//! label model, and the parts of representatives are clustered again as the collection grows.
+//! Discovers labels until a person changes some. A new shape is labelled by the votes of the
+//! nearest shapes and by the label model. The parts of representatives are clustered again as the
+//! collection grows.
 
 use super::state::Epoch;
 use super::up::UpFound;
@@ -7,9 +8,10 @@ use super::{Collection, ModelState, Staleness, State};
 use crate::labels::DiscoveryOptions;
 use crate::library::change::Change;
 use crate::library::error::Result;
+use crate::library::event::EventKind;
 use crate::library::labelling::{Relabelled, cause, face_ids, new_labels_of};
 use crate::library::sources::{FileView, Known, Sources};
-use crate::library::types::{EventKind, Up};
+use crate::library::types::Up;
 use crate::library::voting::{
     IncomingMap, PreparedShape, Voted, Voter, new_maps, rank_candidates, sources_of, votes,
 };
@@ -19,17 +21,18 @@ use crate::pipeline::{
 };
 use crate::store::{Digest, ShapeId};
 
-/// Most functional maps one addition computes.
+/// Maximum number of functional maps that one addition computes.
 pub const MAX_MAPS: usize = 5;
-/// Most stored shapes that are clustered together, and so relabelled, by one addition; those that
-/// stale sources of the new shape add to it are at most [`MAX_MAPS`].
+/// Maximum number of stored shapes that one addition clusters together and therefore relabels.
+/// Stale sources of the new shape add at most [`MAX_MAPS`] to it.
 pub const MAX_REPRESENTATIVES: usize = 40;
-/// Shapes below which a collection is too small to judge a labelling: the new one is always taken.
+/// Number of shapes below which a collection is too small to judge a labelling, so that the new one
+/// is always accepted.
 const TOO_FEW: usize = 5;
-/// By how much more a new labelling must be worth once only a sample of the shapes is clustered: a
-/// quarter of a nat, as if boundaries were a quarter more concave. It knows no more than the
-/// labelling in force, which was found on as many shapes, and the best of hundreds of candidates on
-/// another sample always seems a little better.
+/// Least gain of a new labelling, once only a sample of the shapes is clustered: a quarter of a
+/// nat, as if boundaries were a quarter more concave. The new labelling has no more evidence than
+/// the labelling in force, which was found on as many shapes, and the best of hundreds of
+/// candidates on another sample always seems a little better.
 const SAMPLE_GAIN: f64 = 0.25;
 /// Growth of a collection from one re-clustering to the next.
 const RECLUSTER_GROWTH: f64 = 1.4;
@@ -38,7 +41,7 @@ const RECLUSTER_GROWTH: f64 = 1.4;
 #[derive(Debug, Clone, Copy)]
 pub(in crate::library) struct NewShape<'a> {
     pub(in crate::library) arrays: FileView<'a>,
-    /// Of its original bytes.
+    /// Digest of its original bytes.
     pub(in crate::library) digest: Digest,
 }
 
@@ -49,29 +52,29 @@ pub(in crate::library) struct Plan {
     pub(in crate::library) state: State,
     /// Labelling of the new shape, by the classes of `model`.
     pub(in crate::library) labelling: Labelling,
-    /// Stored shapes with a new labelling.
+    /// Stored shapes with their new labellings.
     pub(in crate::library) relabelled: Vec<(Known, Labelling)>,
     pub(in crate::library) changes: Vec<LabelChange>,
     pub(in crate::library) reclustered: Option<EventKind>,
     pub(in crate::library) staleness: Staleness,
 }
 
-/// Representatives that were clustered together.
+/// The representatives that were clustered together.
 #[derive(Debug)]
 pub(in crate::library) struct Clustered {
     /// Their indices in the collection.
     chosen: Vec<usize>,
     known: Vec<Known>,
-    /// Where among them the new shape is.
+    /// Position of the new shape among them.
     new_at: usize,
-    /// What they show of the up axis.
+    /// Evidence of them about the up axis.
     up: UpFound,
     outcome: Reclustering,
 }
 
-/// By how much more than the labelling in force a new one must be worth in a collection of so many
-/// shapes. Nothing while all of them are clustered, each time with many that were not there before:
-/// a margin would keep what was found when there was less to go by.
+/// Returns the least gain of a new labelling over the labelling in force in a collection of so many
+/// shapes. It is zero while all shapes are clustered, each time with many new ones: a margin would
+/// retain labels that were found with less evidence.
 pub fn min_gain(n_shapes: usize) -> f64 {
     match n_shapes {
         0..=TOO_FEW => f64::NEG_INFINITY,
@@ -80,8 +83,8 @@ pub fn min_gain(n_shapes: usize) -> f64 {
     }
 }
 
-/// Number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 39,
-/// 55, …
+/// Returns the number of shapes at which a collection is clustered next: 1, 2, 3, 4, 5, 7, 10, 14,
+/// 20, 28, 39, 55, …
 pub fn next_recluster(n_shapes: u64) -> u64 {
     if n_shapes < TOO_FEW as u64 {
         return n_shapes + 1;
@@ -89,7 +92,7 @@ pub fn next_recluster(n_shapes: u64) -> u64 {
     (n_shapes as f64 * RECLUSTER_GROWTH).round() as u64
 }
 
-/// The shapes that vote for a new one, which must not be stale then.
+/// Returns the shapes that vote for a new one. They must not be stale then.
 pub(in crate::library) fn sources_for(
     collection: &Collection,
     sources: &dyn Sources,
@@ -99,7 +102,7 @@ pub(in crate::library) fn sources_for(
     rank_candidates(collection, sources, shape, &all, MAX_MAPS)
 }
 
-/// Maps the shapes `nearest` to a new one and labels it; `None`: there is no model yet.
+/// Maps the shapes `nearest` to a new one and labels it; `None` without a model.
 pub(in crate::library) fn label_new(
     collection: &Collection,
     sources: &dyn Sources,
@@ -126,13 +129,13 @@ pub(in crate::library) fn label_new(
     Ok(Some(Voted::new(labelling, &voters, maps)))
 }
 
-/// Whether the collection is clustered again when one more shape is added.
+/// Returns whether the addition of one more shape clusters the collection again.
 pub(in crate::library) fn is_due(collection: &Collection) -> bool {
     collection.shapes().len() as u64 + 1 >= collection.state().next_recluster
 }
 
-/// What an addition changes. `labelling` is that of [`label_new`]; where clustering is due, no
-/// representative may be stale.
+/// Returns the plan of an addition. `labelling` is that of [`label_new`]. Where clustering is due,
+/// no representative may be stale.
 pub(in crate::library) fn plan(
     collection: &Collection,
     sources: &dyn Sources,
@@ -147,7 +150,7 @@ pub(in crate::library) fn plan(
     }
 }
 
-/// An addition without a re-clustering.
+/// Returns the plan of an addition without a re-clustering.
 fn grown(
     collection: &Collection,
     sources: &dyn Sources,
@@ -191,8 +194,8 @@ fn reclustered(
     if let (false, Some(labelling), Some(model)) =
         (found.outcome.accepted, labelling, collection.model())
     {
-        // The epoch goes on: stale shapes are labelled by the model and the representatives that
-        // made them so, whether that happens before or after this.
+        // The epoch continues. Stale shapes are labelled by the model and the representatives of
+        // its beginning, whether that happens before or after this addition.
         let mut plan = grown(collection, sources, model, labelling, new.arrays);
         plan.state.next_recluster = next_recluster;
         plan.state.up_disagrees = found.up.disagrees;
@@ -218,7 +221,7 @@ fn reclustered(
 }
 
 impl Clustered {
-    /// The event that tells of it, and whether its labels are taken.
+    /// Returns the event of the re-clustering, and whether its labels were accepted.
     fn event(&self, accepted: bool) -> EventKind {
         let (before, after) = self.outcome.scores;
         EventKind::Reclustered {
@@ -228,7 +231,7 @@ impl Clustered {
         }
     }
 
-    /// The state at the beginning of the epoch.
+    /// Returns the state at the beginning of the epoch.
     fn epoch(
         &self,
         collection: &Collection,
@@ -253,8 +256,8 @@ impl Clustered {
     }
 }
 
-/// Clusters the parts of the representatives, none of which may be stale, along the axis that is
-/// `up`; with a new shape, if there is one, and its labels by the model in force.
+/// Clusters the parts of the representatives, none of which may be stale, along the axis `up`; with
+/// a new shape, if there is one, and its labels by the model in force.
 fn cluster(
     collection: &Collection,
     sources: &dyn Sources,
@@ -286,7 +289,7 @@ fn cluster(
         .collect();
     let mut new_at = chosen.len();
     if let Some((new, _)) = new {
-        // The new shape, too, has its place by its digest.
+        // The position of the new shape, too, follows from its digest.
         new_at = chosen.partition_point(|at| collection.shapes()[*at].digest <= new.digest);
         let new = Representative {
             shape: new.arrays.view,
@@ -326,7 +329,8 @@ fn known_of(
     known.collect()
 }
 
-/// What the representatives, and a new shape if there is one, show where `up` is given.
+/// Returns the evidence of the representatives, and of a new shape if there is one, about the up
+/// axis.
 pub(in crate::library) fn up_found(
     collection: &Collection,
     sources: &dyn Sources,
@@ -343,7 +347,7 @@ pub(in crate::library) fn up_found(
 }
 
 /// Clusters the representatives, none of which may be stale, along another up axis. The labels in
-/// force were found along an axis that a person calls wrong: they do not compete.
+/// force do not compete, because they were found along an axis that a person calls wrong.
 pub(in crate::library) fn turn(
     collection: &Collection,
     sources: &dyn Sources,
@@ -370,9 +374,9 @@ pub(in crate::library) fn turn(
     })
 }
 
-/// Relabels a stale shape from stored maps and the model its epoch began with: a vote and a cut.
-/// `None`: it is not stale. The result depends on neither the time nor the order in which stale
-/// shapes are labelled, because only representatives, which are never stale, vote.
+/// Relabels a stale shape from stored maps and the model with which its epoch began: a vote and a
+/// cut. Returns `None` if it is not stale. The result depends on neither the time nor the order in
+/// which stale shapes are labelled, because only representatives vote, which are never stale.
 pub(in crate::library) fn relabel(
     collection: &Collection,
     sources: &dyn Sources,
@@ -410,7 +414,7 @@ pub(in crate::library) fn relabel(
     }))
 }
 
-/// The model without a shape; `None`: the shape does not inform it.
+/// Returns the model without a shape; `None` if the shape is not part of it.
 pub(in crate::library) fn model_without(
     collection: &Collection,
     sources: &dyn Sources,
@@ -434,7 +438,8 @@ pub(in crate::library) fn model_without(
     Ok(Some(model))
 }
 
-/// Classes of a model, given label ids; an id the model does not know counts as the first class.
+/// Returns the classes of label ids in a model. An id that the model does not know counts as the
+/// first class.
 fn classes_of(ids: &[i32], labels: &[u32]) -> Vec<u32> {
     let class = |id: &i32| {
         let found = labels.iter().position(|l| i64::from(*l) == i64::from(*id));

@@ -1,8 +1,8 @@
-//! The label model is fitted to the training shapes: a few representatives are labelled together.
+//! Fits the label model to the training shapes: a few representatives are labelled together.
 //!
-//! Every step is a change of its own, so that none takes long and a crash loses little: descriptors
-//! are standardised, missing maps between the representatives are computed a few shapes at a time,
-//! then the model is fitted to all of them at once.
+//! Every step is a change of its own, so that none takes long and a crash loses little. First,
+//! descriptors are standardised. Then missing maps between the representatives are computed, for a
+//! few shapes at a time. Last, the model is fitted to all of them at once.
 
 use super::discovered::{MAX_MAPS, MAX_REPRESENTATIVES};
 use super::state::{Phase, Supervision};
@@ -27,14 +27,14 @@ use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Most training shapes among the representatives that the model is fitted to.
+/// Maximum number of training shapes among the representatives to which the model is fitted.
 const MAX_FITTED_TRAINING: usize = MAX_REPRESENTATIVES / 2;
 
-/// Maps that one step computes side by side, if so many are missing: enough for all processors, and
-/// about a second of work on two.
+/// Number of maps that one step computes in parallel, if so many are missing: enough for all
+/// processors, and about a second of work on two.
 const MAPS_A_STEP: usize = 40;
 
-/// A representative that the model is fitted to.
+/// A representative to which the model is fitted.
 struct Member {
     at: usize,
     known: Known,
@@ -44,7 +44,7 @@ struct Member {
     discovered: Vec<u8>,
 }
 
-/// The collection while a model is fitted to some of its shapes.
+/// The collection during a fit of a model to some of its shapes.
 struct Fit<'a> {
     collection: &'a Collection,
     sources: &'a dyn Sources,
@@ -54,7 +54,8 @@ struct Fit<'a> {
     chosen: Vec<usize>,
 }
 
-/// The next step of fitting the model; `None`: it is fitted, or there is none to begin with.
+/// Returns the next step of fitting the model; `None` if it is fitted, or if there is no model to
+/// begin with.
 pub(in crate::library) fn step(
     collection: &Collection,
     sources: &dyn Sources,
@@ -86,8 +87,8 @@ pub(in crate::library) fn step(
     }
 }
 
-/// The shapes that the model is fitted to: training shapes and others, of each those of the least
-/// digests, by these.
+/// Returns the shapes to which the model is fitted: training shapes and others, those of the least
+/// digests in each group, in the order of their digests.
 pub(in crate::library) fn members(collection: &Collection) -> Vec<usize> {
     let shapes = collection.shapes();
     let by_digest = collection.representatives(shapes.len());
@@ -111,9 +112,9 @@ impl Fit<'_> {
         known.collect()
     }
 
-    /// Ends a fit for which nobody's labels are left, because the training shapes were removed
-    /// before it: all shapes keep the labels they have, and the model stays or, if its descriptors
-    /// are standardised already, follows from these labels.
+    /// Ends a fit without labels of persons, because the training shapes were removed before it.
+    /// All shapes keep their labels. The model stays or, if its descriptors are already
+    /// standardised, follows from these labels.
     fn unfounded(&self) -> Result<Change> {
         let shapes = self.collection.shapes();
         let mut model = self.model.clone();
@@ -169,7 +170,8 @@ impl Fit<'_> {
         })
     }
 
-    /// The members that vote for member `to`: the nearest training shapes, and the nearest others.
+    /// Returns the members that vote for member `to`: the nearest training shapes, and the nearest
+    /// others.
     fn voters_of(&self, known: &[Known], to: usize) -> Vec<usize> {
         let shapes = self.collection.shapes();
         let view = known[to].view();
@@ -190,8 +192,8 @@ impl Fit<'_> {
             .collect()
     }
 
-    /// Computes maps that are missing between members: all to one member, and to more of them until
-    /// they are [`MAPS_A_STEP`]; `None`: none is missing.
+    /// Computes missing maps between members: all to one member, and to further members until there
+    /// are [`MAPS_A_STEP`]. Returns `None` if no map is missing.
     fn missing_maps(&self, known: &[Known]) -> Result<Option<Change>> {
         let mut missing = Vec::new();
         for to in 0..known.len() {
@@ -287,7 +289,7 @@ impl Fit<'_> {
         })
     }
 
-    /// The labels of the new model's classes.
+    /// Returns the labels of the new model's classes.
     fn labels(&self) -> Result<Vec<LabelId>> {
         let used = used_labels(self.collection, self.sources, None)?;
         let mut labels: BTreeSet<LabelId> = used.labels;
@@ -297,7 +299,7 @@ impl Fit<'_> {
         Ok(labels.into_iter().collect())
     }
 
-    /// The stored maps between the members.
+    /// Returns the stored maps between the members.
     fn incoming_maps(&self, known: &[Known]) -> Result<Vec<(usize, usize, IncomingMap)>> {
         let mut maps = Vec::new();
         for to in 0..known.len() {
@@ -311,7 +313,7 @@ impl Fit<'_> {
         Ok(maps)
     }
 
-    /// The representatives with their pins and with the labels discovered on them.
+    /// Returns the representatives with their pins and their discovered labels.
     fn members(&self, known: Vec<Known>, labels: &[LabelId]) -> Result<Vec<Member>> {
         let mut members = Vec::with_capacity(known.len());
         for (at, known) in self.chosen.iter().zip(known) {
@@ -341,7 +343,7 @@ impl Fit<'_> {
         }
     }
 
-    /// Probabilities `(m, k)` of discovered labels, as of when discovery ended.
+    /// Returns the probabilities `(m, k)` of the discovered labels at the end of discovery.
     fn discovered_probabilities(
         &self,
         known: &Known,
@@ -375,15 +377,15 @@ impl Fit<'_> {
         Ok(out)
     }
 
-    /// The discovered labels, as the labels they were merged into.
+    /// Returns the discovered labels, each resolved to the label into which it was merged.
     fn resolved_discovered(&self) -> Result<Vec<LabelId>> {
         let rows = self.sources.labels(self.collection.id())?;
         let labels = self.supervision.discovered().labels.iter();
         Ok(labels.map(|label| resolved(&rows, *label)).collect())
     }
 
-    /// Statistics of the pinned faces of training shapes that are no members, and of discovered
-    /// labels where those are still given.
+    /// Returns statistics of the pinned faces of training shapes outside the fit, and of discovered
+    /// labels where shapes still have them.
     fn evidence_elsewhere(&self, model: &LabelModel) -> Result<Statistics> {
         let (k, dim) = (model.labels.len(), model.normalisation.mean.len());
         let mut evidence = Statistics::empty(k, dim);
@@ -419,7 +421,8 @@ impl Fit<'_> {
         Ok(evidence)
     }
 
-    /// Number of training shapes, each by the share of its area that is pinned.
+    /// Returns the number of training shapes, each weighted by the share of its area that is
+    /// pinned.
     fn n_training(&self, members: &[Member]) -> Result<f64> {
         let mut n = 0.0;
         for (at, shape) in self.collection.shapes().iter().enumerate() {
@@ -434,8 +437,8 @@ impl Fit<'_> {
         Ok(n)
     }
 
-    /// Statistics of the labels as they were when discovery ended, where shapes cannot carry those
-    /// labels any more; `None` also if there were fewer than two.
+    /// Returns statistics of the discovered labels at the end of discovery, if shapes cannot have
+    /// those labels any more; `None` also if there were fewer than two labels.
     fn discovered_statistics(&self, model: &LabelModel) -> Result<Option<Statistics>> {
         let k = self.supervision.discovered().labels.len();
         if !self.supervision.is_closed() || k < 2 {
@@ -443,7 +446,7 @@ impl Fit<'_> {
         }
         let mut discovered = Statistics::empty(k, model.normalisation.mean.len());
         for (ordinal, version) in &self.supervision.discovered().versions {
-            // Shapes may have been removed since, and old versions are not stored for ever.
+            // Shapes may have been removed since, and old versions are deleted at some time.
             let shapes = self.collection.shapes();
             let Some(shape) = shapes.iter().find(|s| s.ordinal == *ordinal) else {
                 continue;
@@ -464,16 +467,16 @@ impl Fit<'_> {
     }
 }
 
-/// The class of the highest probability; of equal ones the first.
+/// Returns the class of the highest probability; of equal ones the first.
 fn most_likely(row: &[u8]) -> Option<usize> {
     (0..row.len()).max_by(|&a, &b| row[a].cmp(&row[b]).then(b.cmp(&a)))
 }
 
-/// The label that an id stands for, after merging.
+/// Returns the label to which an id resolves after merges.
 fn resolved(rows: &[LabelRow], id: LabelId) -> LabelId {
     let into = |id: LabelId| rows.iter().find(|l| l.id == id).and_then(|l| l.merged_into);
     let mut id = id;
-    // Chains are as long as there are labels at most.
+    // A chain has at most as many links as there are labels.
     for _ in 0..rows.len() {
         match into(id) {
             Some(next) => id = next,

@@ -1,10 +1,10 @@
-//! One collection in memory: the aggregate that decides, without touching the catalog, what labels
-//! follow from what is stored.
+//! One collection in memory: the aggregate that decides, without touching the catalog, which labels
+//! follow from the stored data.
 //!
 //! [`discovered`] and [`supervised`] compute changes from a `&Collection` and its [`Sources`];
-//! [`super::change::commit`] writes them and then lets the collection apply them. Nothing else
+//! [`super::change::commit`] writes them, and the collection then applies them. Nothing else
 //! changes a collection: its fields are private, and [`Collection::apply`] and
-//! [`Collection::set_aside`] are the only methods that take it by `&mut`.
+//! [`Collection::set_aside`] are the only methods with `&mut self`.
 
 pub(super) mod discovered;
 pub(super) mod fit;
@@ -25,12 +25,12 @@ use crate::labels::LabelModel;
 use crate::neighbors::SignatureMetric;
 use crate::store::{CollectionId, CollectionRow, Digest, Reader, ShapeId};
 
-/// A stored shape, as far as placing others needs it without opening its file.
+/// A stored shape, with the fields that placing others needs without opening its file.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct KnownShape {
     pub(super) id: ShapeId,
     pub(super) ordinal: u64,
-    /// Of the original bytes.
+    /// Digest of the original bytes.
     pub(super) digest: Digest,
     pub(super) stale: bool,
     /// Whether a person labelled faces of it.
@@ -38,8 +38,8 @@ pub(super) struct KnownShape {
     pub(super) signature: Vec<f32>,
 }
 
-/// One collection: read from the catalog when it is first needed, and equal to it after every
-/// commit.
+/// One collection, which is read from the catalog when it is first needed, and is equal to it after
+/// every commit.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Collection {
     row: CollectionRow,
@@ -49,42 +49,42 @@ pub(super) struct Collection {
     shapes: Vec<KnownShape>,
 }
 
-/// Which shapes are stale after a change, but for those that it names.
+/// Which shapes are stale after a change, except for those that it names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum Staleness {
-    /// Shapes with new labels are not; the others stay as they are.
+    /// Shapes with new labels are not stale; the others stay as they are.
     #[default]
     AsLabelled,
-    /// All but the shapes with new labels.
+    /// All shapes are stale except those with new labels.
     AllOthers,
     /// Every shape stays as it is, because labels are only renamed.
     Unchanged,
-    /// Every shape.
+    /// All shapes are stale.
     All,
 }
 
-/// A change that is durable, as far as the collection in memory shows it.
+/// The effect of a durable change on the collection in memory.
 #[derive(Debug)]
 pub(super) struct Applied {
-    /// The row as it is now.
+    /// The new row.
     pub(super) row: CollectionRow,
-    /// The state in that row; `None`: as it was.
+    /// The state in that row; `None` if it did not change.
     pub(super) state: Option<State>,
-    /// `None`: as it was.
+    /// The new model; `None` if it did not change.
     pub(super) model: Option<ModelState>,
     pub(super) removed: Option<ShapeId>,
     pub(super) added: Option<KnownShape>,
-    /// Shapes whose pins changed, and whether they have any now.
+    /// Shapes whose pins changed, and whether they still have any.
     pub(super) pinned: Vec<(ShapeId, bool)>,
     /// Stored shapes with new labels.
     pub(super) labelled: Vec<ShapeId>,
     pub(super) staleness: Staleness,
-    /// Shapes that are stale or not in spite of `staleness`.
+    /// Shapes that are stale, or not, in spite of `staleness`.
     pub(super) stale: Vec<(ShapeId, bool)>,
 }
 
 impl Collection {
-    /// The collection in the catalog.
+    /// Loads a collection from the catalog.
     pub(super) fn load(reader: &Reader<'_>, row: CollectionRow) -> Result<Self> {
         let location = format!("collections {}", row.name);
         let state = State::of(&row)?;
@@ -135,27 +135,27 @@ impl Collection {
         self.model.as_ref()
     }
 
-    /// The label model as it has grown.
+    /// Returns the label model with all shapes added so far.
     pub(super) fn label_model(&self) -> Option<&LabelModel> {
         self.model.as_ref().map(|m| &m.model)
     }
 
-    /// The stored shapes by ordinal; functions name them by their index here.
+    /// Returns the stored shapes by ordinal. Other functions refer to them by index.
     pub(super) fn shapes(&self) -> &[KnownShape] {
         &self.shapes
     }
 
-    /// The index of a shape.
+    /// Returns the index of a shape.
     pub(super) fn position(&self, id: ShapeId) -> Option<usize> {
         self.shapes.iter().position(|s| s.id == id)
     }
 
-    /// Which way is up, as it was set.
+    /// Returns the up axis as it was set.
     pub(super) fn up(&self) -> Up {
         self.row.up.parse().unwrap_or_default()
     }
 
-    /// Indices of the shapes nearest to a signature, nearest first.
+    /// Returns the indices of the shapes nearest to a signature, nearest first.
     pub(super) fn nearest(
         &self,
         signature: &[f32],
@@ -166,7 +166,7 @@ impl Collection {
         self.nearest_among(&all, signature, n_descriptors, limit)
     }
 
-    /// Those of the shapes `among` that are nearest to a signature, nearest first.
+    /// Returns those of the shapes `among` that are nearest to a signature, nearest first.
     pub(super) fn nearest_among(
         &self,
         among: &[usize],
@@ -183,8 +183,8 @@ impl Collection {
         found.map(|(i, distance)| (among[i], distance)).collect()
     }
 
-    /// Shapes to be clustered together, at most `limit`: those of the least digests, by their
-    /// digests. That is a random choice that does not depend on the order of arrival and changes
+    /// Returns the shapes to be clustered together, at most `limit`: those of the least digests, in
+    /// this order. This is a random choice that does not depend on the order of arrival and changes
     /// little as the collection grows.
     pub(super) fn representatives(&self, limit: usize) -> Vec<usize> {
         let mut all: Vec<usize> = (0..self.shapes.len()).collect();
@@ -193,9 +193,9 @@ impl Collection {
         all
     }
 
-    /// Takes out a shape that is about to be replaced, so that it neither votes nor trains, and
-    /// sets the model as it is without the shape. The commit of the new shape removes the old one
-    /// from the catalog; if that fails, the collection is loaded again.
+    /// Removes a shape that is about to be replaced, so that it neither votes nor trains, and sets
+    /// the model without the shape. The commit of the new shape removes the old one from the
+    /// catalog; if that fails, the collection is reloaded.
     pub(super) fn set_aside(&mut self, id: ShapeId, model: Option<ModelState>) {
         self.shapes.retain(|s| s.id != id);
         if model.is_some() {
@@ -203,7 +203,7 @@ impl Collection {
         }
     }
 
-    /// Brings the collection up to a change that was committed.
+    /// Applies a change that was committed.
     pub(super) fn apply(&mut self, change: Applied) {
         self.row = change.row;
         if let Some(state) = change.state {

@@ -1,13 +1,13 @@
-//! The model of a collection becomes bytes and back: one safetensors buffer in the catalog.
+//! Encodes the model of a collection as one safetensors buffer for the catalog, and decodes it.
 
 use crate::labels::{LabelModel, Normalisation, PriorLabels, Statistics};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
 use std::collections::HashMap;
 
-/// The label model as it grows, and as it was when its epoch began.
+/// The label model in two states: with all shapes added so far, and as it was when its epoch began.
 ///
-/// New shapes are labelled by `model`; stored shapes that an accepted re-clustering made stale are
-/// labelled by `base`, so that the result does not depend on when that is done.
+/// New shapes are labelled by `model`. Stored shapes that an accepted re-clustering made stale are
+/// labelled by `base`, so that the result does not depend on the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(in crate::library) struct ModelState {
     pub(in crate::library) model: LabelModel,
@@ -17,7 +17,7 @@ pub(in crate::library) struct ModelState {
 }
 
 impl ModelState {
-    /// The model at the beginning of an epoch.
+    /// Begins an epoch with a model.
     pub(in crate::library) fn begin(model: LabelModel) -> Self {
         Self {
             base: model.statistics.clone(),
@@ -26,7 +26,7 @@ impl ModelState {
         }
     }
 
-    /// The model as it was when the epoch began.
+    /// Returns the model as it was when the epoch began.
     pub(in crate::library) fn base_model(&self) -> LabelModel {
         LabelModel {
             statistics: self.base.clone(),
@@ -34,7 +34,7 @@ impl ModelState {
         }
     }
 
-    /// The bytes.
+    /// Encodes the model.
     pub(in crate::library) fn encode(&self) -> Vec<u8> {
         let m = &self.model;
         let dim = m.normalisation.mean.len();
@@ -81,7 +81,7 @@ impl ModelState {
         serialize(views, Some(epoch)).expect("invariant: names are unique and metadata is text")
     }
 
-    /// The value that [`ModelState::encode`] wrote; an error says what is wrong with the bytes.
+    /// Decodes a value that [`ModelState::encode`] encoded. The error names the fault of the bytes.
     pub(in crate::library) fn decode(bytes: &[u8]) -> Result<Self, String> {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| e.to_string())?;
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
@@ -128,7 +128,7 @@ impl ModelState {
                 let n = meaning.len() / k.max(1);
                 let ([agreement], true) = (&agreement[..], meaning.len() == n * k) else {
                     return Err(format!(
-                        "label model: what was discovered does not fit {k} labels"
+                        "label model: the discovered labels do not fit {k} labels"
                     ));
                 };
                 Some(PriorLabels {
@@ -161,7 +161,7 @@ impl ModelState {
     }
 }
 
-/// The lower triangle, row by row.
+/// Returns the lower triangle, row by row.
 fn triangle(square: &[f64], dim: usize) -> Vec<f64> {
     (0..dim)
         .flat_map(|i| square[i * dim..=i * dim + i].iter().copied())

@@ -1,4 +1,4 @@
-//! What decides how a collection is labelled next: its regime, and the changes of regime.
+//! The state that decides how a collection is labelled next: its regime, and the changes of regime.
 
 use super::up::{UpFound, UpState};
 use crate::library::types::LabelId;
@@ -6,22 +6,22 @@ use crate::library::types::LabelId;
 /// The state of a collection besides its model and its shapes.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(in crate::library) struct State {
-    /// Number of shapes at which the parts are clustered again, or the model is fitted again.
+    /// Number of shapes at which the parts are clustered again or the model is fitted again.
     pub(in crate::library) next_recluster: u64,
     /// The epoch of discovery: the one in force, or the last one before a person labelled faces.
     pub(in crate::library) epoch: Epoch,
-    /// Where labels come from.
+    /// The regime, which decides where labels come from.
     pub(in crate::library) regime: Regime,
-    /// The estimate, where the up axis is estimated.
+    /// The estimate, if the up axis is estimated.
     pub(in crate::library) up: Option<UpState>,
-    /// Where the up axis is given: another one along which shapes stand clearly better.
+    /// If the up axis is given: another one along which shapes stand clearly better.
     pub(in crate::library) up_disagrees: Option<UpState>,
     /// The newest job that propagates a correction.
     pub(in crate::library) propagation: Option<Propagation>,
 }
 
 impl State {
-    /// The same state, with what shapes show of the up axis.
+    /// Returns the same state with the evidence of shapes about the up axis.
     pub(in crate::library) fn with_up(self, found: &UpFound) -> Self {
         Self {
             up: found.estimate,
@@ -34,17 +34,17 @@ impl State {
 /// The time from one accepted re-clustering to the next.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(in crate::library) struct Epoch {
-    /// Ordinals of the shapes that were clustered together when it began.
+    /// Ordinals of the shapes that were clustered together at its beginning.
     pub(in crate::library) representatives: Vec<u64>,
-    /// Newest ordinal when it began.
+    /// The newest ordinal at its beginning.
     pub(in crate::library) last_ordinal: u64,
-    /// Ordinals of later shapes that do not inform the model: a correction labelled them that was
-    /// undone.
+    /// Ordinals of later shapes that are not part of the model, because a correction that was
+    /// undone labelled them.
     pub(in crate::library) silent: Vec<u64>,
 }
 
 impl Epoch {
-    /// Whether the labels of the shape with this ordinal are part of the model.
+    /// Returns whether the labels of the shape with this ordinal are part of the model.
     pub(in crate::library) fn informs(&self, ordinal: u64) -> bool {
         let is_newer = ordinal > self.last_ordinal;
         is_newer && !self.silent.contains(&ordinal) || self.representatives.contains(&ordinal)
@@ -56,7 +56,7 @@ impl Epoch {
 pub(in crate::library) struct Propagation {
     /// Its id.
     pub(in crate::library) job: u64,
-    /// Shapes that were stale when it began.
+    /// Number of shapes that were stale when it began.
     pub(in crate::library) n_shapes: u64,
 }
 
@@ -66,7 +66,7 @@ pub(in crate::library) enum Regime {
     /// Parts are clustered, and the collection is clustered again as it grows.
     #[default]
     Discovering,
-    /// A person changed labels: they follow from the training shapes, and nothing is clustered.
+    /// A person changed labels. Labels follow from the training shapes, and nothing is clustered.
     Supervised(Supervision),
 }
 
@@ -79,16 +79,16 @@ pub(in crate::library) struct Supervision {
     discovered: Discovered,
 }
 
-/// Which labels shapes can carry.
+/// Which labels shapes can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::library) enum Vocabulary {
-    /// Those that persons used, and those that were discovered before.
+    /// Labels that persons used, and labels that were discovered before.
     Open,
-    /// Those that persons used: a person labelled a whole shape.
+    /// Labels that persons used, because a person labelled a whole shape.
     Closed,
 }
 
-/// How far the model follows from the training shapes.
+/// Whether the model is up to date with the training shapes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::library) enum Phase {
     /// Descriptors must be standardised over the shapes of the next fit.
@@ -102,14 +102,14 @@ pub(in crate::library) enum Phase {
 /// Labels that were discovered before a person changed any.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(in crate::library) struct Discovered {
-    /// Ordinals of representatives, and the version of the labels that each had.
+    /// Ordinals of representatives, each with the version of its labels.
     pub(in crate::library) versions: Vec<(u64, u64)>,
     /// Label of each class in the probabilities of those versions.
     pub(in crate::library) labels: Vec<LabelId>,
 }
 
 impl Discovered {
-    /// The version in which the shape with this ordinal had discovered labels.
+    /// Returns the version in which the shape with this ordinal had discovered labels.
     pub(in crate::library) fn version_of(&self, ordinal: u64) -> Option<u64> {
         let found = self.versions.iter().find(|v| v.0 == ordinal);
         found.map(|v| v.1)
@@ -117,7 +117,7 @@ impl Discovered {
 }
 
 impl Regime {
-    /// What supervises the collection, if a person does.
+    /// Returns the supervision of the collection, if there is one.
     pub(in crate::library) fn supervision(&self) -> Option<&Supervision> {
         match self {
             Self::Discovering => None,
@@ -127,8 +127,8 @@ impl Regime {
 }
 
 impl Supervision {
-    /// The end of discovery by a change that keeps model and labels: the model counts as fitted to
-    /// the representatives.
+    /// Ends discovery by a change that keeps model and labels: the model counts as fitted to the
+    /// representatives.
     pub(in crate::library) fn renamed(discovered: Discovered) -> Self {
         Self {
             vocabulary: Vocabulary::Open,
@@ -138,7 +138,7 @@ impl Supervision {
         }
     }
 
-    /// The end of discovery by labelled faces, to which a model must be fitted.
+    /// Ends discovery because faces were labelled, to which a model must be fitted.
     pub(in crate::library) fn begun(vocabulary: Vocabulary, discovered: Discovered) -> Self {
         Self {
             vocabulary,
@@ -148,7 +148,7 @@ impl Supervision {
         }
     }
 
-    /// The training shapes have changed.
+    /// Returns the supervision after a change of the training shapes.
     pub(in crate::library) fn outdated(self, vocabulary: Vocabulary) -> Self {
         Self {
             vocabulary,
@@ -157,7 +157,8 @@ impl Supervision {
         }
     }
 
-    /// Other versions show the discovered labels from now on, and the model must be fitted to them.
+    /// Returns the supervision with other versions of the discovered labels, to which the model
+    /// must be fitted.
     pub(in crate::library) fn rediscovered(self, discovered: Discovered) -> Self {
         Self {
             phase: Phase::Outdated,
@@ -166,7 +167,7 @@ impl Supervision {
         }
     }
 
-    /// The discovered labels are no evidence any more.
+    /// Returns the supervision without the discovered labels, which are no evidence any more.
     pub(in crate::library) fn without_discovered(self) -> Self {
         Self {
             discovered: Discovered::default(),
@@ -174,7 +175,7 @@ impl Supervision {
         }
     }
 
-    /// Descriptors are standardised.
+    /// Returns the supervision after descriptors were standardised.
     pub(in crate::library) fn standardised(self) -> Self {
         Self {
             phase: match self.phase {
@@ -185,7 +186,7 @@ impl Supervision {
         }
     }
 
-    /// The model is fitted to the shapes with these ordinals.
+    /// Returns the supervision after the model was fitted to the shapes with these ordinals.
     pub(in crate::library) fn fitted(self, trained: Vec<u64>) -> Self {
         Self {
             phase: Phase::Fitted,
@@ -194,7 +195,7 @@ impl Supervision {
         }
     }
 
-    /// A supervision as it was stored.
+    /// Returns a supervision from its stored fields.
     pub(super) fn stored(
         vocabulary: Vocabulary,
         phase: Phase,
@@ -213,7 +214,7 @@ impl Supervision {
         self.phase
     }
 
-    /// Ordinals of the shapes that the model was fitted to; their labels vote.
+    /// Returns the ordinals of the shapes to which the model was fitted; their labels vote.
     pub(in crate::library) fn trained(&self) -> &[u64] {
         &self.trained
     }

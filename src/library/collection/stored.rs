@@ -1,4 +1,4 @@
-//! The state of a collection as the catalog stores it, and back. The names and their order are
+//! Encodes the state of a collection for the catalog, and decodes it. The names and their order are
 //! those of the first release, so that every library reads and writes the same text.
 
 use super::state::{Discovered, Epoch, Phase, Propagation, Regime, State, Supervision, Vocabulary};
@@ -43,7 +43,7 @@ struct StoredSupervision {
 }
 
 impl State {
-    /// The state in a collection's row; the state of a new collection, where there is none yet.
+    /// Returns the state in a collection's row, or that of a new collection if there is none yet.
     pub(in crate::library) fn of(row: &CollectionRow) -> Result<Self> {
         let location = format!("collections {}", row.name);
         if row.state.is_empty() {
@@ -54,7 +54,7 @@ impl State {
         Ok(from_json::<StoredState>(text, &location)?.into())
     }
 
-    /// The bytes for a collection's row.
+    /// Encodes the state for a collection's row.
     pub(in crate::library) fn encode(&self) -> Vec<u8> {
         to_json(&StoredState::from(self.clone())).into_bytes()
     }
@@ -137,24 +137,40 @@ mod tests {
     use super::{State, StoredState};
     use crate::library::rows::{from_json, to_json};
 
-    /// Texts as earlier releases wrote them; the last two lack what came later.
+    /// Texts of earlier releases; the last two lack later fields.
     #[test]
     fn states_are_written_as_they_were_read() {
         for (text, is_old) in [
             (
-                r#"{"next_recluster":5,"representatives":[1,2,4],"epoch_ordinal":4,"silent":[3],"teaching":null,"up":{"axis":[0.0,1.0,0.0],"agreement":0.75}}"#,
+                concat!(
+                    r#"{"next_recluster":5,"representatives":[1,2,4],"epoch_ordinal":4,"#,
+                    r#""silent":[3],"teaching":null,"up":{"axis":[0.0,1.0,0.0],"agreement":0.75}}"#,
+                ),
                 false,
             ),
             (
-                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":true,"normalised":false,"closed":true,"taught":[1,2],"discovered":[[1,3]],"discovered_labels":[0,2]},"carrying":{"job":9,"n_shapes":4}}"#,
+                concat!(
+                    r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"#,
+                    r#""teaching":{"pending":true,"normalised":false,"closed":true,"#,
+                    r#""taught":[1,2],"discovered":[[1,3]],"discovered_labels":[0,2]},"#,
+                    r#""carrying":{"job":9,"n_shapes":4}}"#,
+                ),
                 false,
             ),
             (
-                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":true,"normalised":true,"closed":false,"taught":[],"discovered":[],"discovered_labels":[]}}"#,
+                concat!(
+                    r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"#,
+                    r#""teaching":{"pending":true,"normalised":true,"closed":false,"taught":[],"#,
+                    r#""discovered":[],"discovered_labels":[]}}"#,
+                ),
                 false,
             ),
             (
-                r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"teaching":{"pending":false,"normalised":true,"closed":false,"taught":[],"discovered":[],"discovered_labels":[]}}"#,
+                concat!(
+                    r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"#,
+                    r#""teaching":{"pending":false,"normalised":true,"closed":false,"taught":[],"#,
+                    r#""discovered":[],"discovered_labels":[]}}"#,
+                ),
                 false,
             ),
             (

@@ -1,6 +1,6 @@
-//! After a person has labelled faces: every shape is labelled on its own by a vote of the nearest
-//! training shapes and of the shapes the model was fitted to, and by that model, which stays as it
-//! is until the training shapes change.
+//! Labels every shape on its own, after a person has labelled faces: by the votes of the nearest
+//! training shapes and of the shapes to which the model was fitted, and by that model, which stays
+//! until the training shapes change.
 
 use super::discovered::{MAX_MAPS, Plan, next_recluster};
 use super::state::{Discovered, Regime, Supervision, Vocabulary};
@@ -20,11 +20,11 @@ use crate::pipeline::{FitOptions, Labelling, label_fitted};
 use crate::store::ShapeId;
 use rayon::prelude::*;
 
-/// Most training shapes that vote for one shape; shapes the model was fitted to fill up to
-/// [`MAX_MAPS`].
+/// Maximum number of training shapes that vote for one shape. Shapes to which the model was fitted
+/// fill up to [`MAX_MAPS`].
 const MAX_TRAINING_VOTES: usize = 3;
 
-/// The discovered labels that stay evidence when discovery ends.
+/// Returns the discovered labels that remain evidence when discovery ends.
 pub(in crate::library) fn discovered(
     collection: &Collection,
     sources: &dyn Sources,
@@ -42,7 +42,7 @@ pub(in crate::library) fn discovered(
     Ok(discovered)
 }
 
-/// The state after a person labelled faces: the model must be fitted.
+/// Returns the state after a person labelled faces: the model must be fitted.
 pub(in crate::library) fn corrected(
     collection: &Collection,
     sources: &dyn Sources,
@@ -55,7 +55,7 @@ pub(in crate::library) fn corrected(
     Ok(with(collection, supervision))
 }
 
-/// The supervision after a person renamed labels: discovery is over, and the model stays.
+/// Returns the supervision after a person renamed labels: discovery has ended, and the model stays.
 pub(in crate::library) fn renamed(
     collection: &Collection,
     sources: &dyn Sources,
@@ -66,7 +66,7 @@ pub(in crate::library) fn renamed(
     })
 }
 
-/// The collection's state under another supervision.
+/// Returns the collection's state under another supervision.
 pub(in crate::library) fn with(collection: &Collection, supervision: Supervision) -> State {
     State {
         regime: Regime::Supervised(supervision),
@@ -74,9 +74,9 @@ pub(in crate::library) fn with(collection: &Collection, supervision: Supervision
     }
 }
 
-/// The supervision under which the model is fitted again, now that there are more shapes or, where
-/// one is `removed`, fewer training shapes. `None`: there is nothing to fit to, and the model
-/// stays.
+/// Returns the supervision under which the model is fitted again, after shapes were added or, with
+/// `removed`, a training shape was removed. Returns `None` if there is nothing to fit to; then the
+/// model stays.
 pub(in crate::library) fn refit(
     collection: &Collection,
     sources: &dyn Sources,
@@ -91,7 +91,7 @@ pub(in crate::library) fn refit(
     Ok(can_fit.then(|| supervision.clone().outdated(used.vocabulary)))
 }
 
-/// Labels a new shape by a fitted model; `None`: the collection is not supervised.
+/// Labels a new shape by a fitted model. Returns `None` if the collection is not supervised.
 pub(in crate::library) fn label_new(
     collection: &Collection,
     sources: &dyn Sources,
@@ -109,8 +109,8 @@ pub(in crate::library) fn label_new(
     Ok(Some(Voted::new(labelling, &voters, maps)))
 }
 
-/// What an addition changes, given its labelling. `lost_training`: the shape replaces a training
-/// shape.
+/// Returns the plan of an addition with its labelling. `lost_training`: the shape replaces a
+/// training shape.
 pub(in crate::library) fn plan(
     collection: &Collection,
     sources: &dyn Sources,
@@ -142,7 +142,7 @@ pub(in crate::library) fn plan(
     })
 }
 
-/// Relabels a stale shape by a fitted model. `None`: it is not stale.
+/// Relabels a stale shape by a fitted model. Returns `None` if it is not stale.
 pub(in crate::library) fn relabel(
     collection: &Collection,
     sources: &dyn Sources,
@@ -183,7 +183,7 @@ pub(in crate::library) fn relabel(
     }))
 }
 
-/// The labels of a stored shape that follow from a labelling and from its pins.
+/// Returns the labels of a stored shape that follow from a labelling and from its pins.
 pub(in crate::library) fn propagated(
     sources: &dyn Sources,
     known: &Known,
@@ -199,8 +199,8 @@ pub(in crate::library) fn propagated(
     Ok(new)
 }
 
-/// The shapes that vote for a shape, itself excluded: training shapes, and shapes the model was
-/// fitted to.
+/// Returns the shapes that vote for a shape, itself excluded: training shapes, and shapes to which
+/// the model was fitted.
 fn voters(
     collection: &Collection,
     sources: &dyn Sources,
@@ -244,7 +244,8 @@ fn voters(
     Ok(voters)
 }
 
-/// Maps from the voters to a stored shape: the stored ones, and new ones to be stored.
+/// Returns the maps from the voters to a stored shape: the stored ones, and new ones, which are to
+/// be stored.
 fn maps_into(
     sources: &dyn Sources,
     voters: &[Voter],
@@ -267,7 +268,7 @@ fn maps_into(
     Ok(maps.collect())
 }
 
-/// Labels a shape by votes and by the fitted model.
+/// Labels a shape by votes and the fitted model.
 fn labelled(
     shape: &PreparedShape<'_>,
     model: &ModelState,

@@ -1,4 +1,4 @@
-//! A collection that no store holds: shapes are discovered, corrected and relabelled in memory.
+//! Tests a collection without a store: shapes are discovered, corrected and relabelled in memory.
 
 use super::{
     Applied, Collection, KnownShape, ModelState, Staleness, discovered, fit, state::Phase,
@@ -31,7 +31,7 @@ struct Shape {
     pins: Option<Vec<i32>>,
 }
 
-/// Everything that a store would hold.
+/// The rows that a store would contain.
 #[derive(Clone, Default)]
 struct Memory {
     shapes: BTreeMap<ShapeId, Shape>,
@@ -102,7 +102,7 @@ impl Sources for Memory {
 }
 
 impl Memory {
-    /// Takes a change of stored shapes, as a commit does.
+    /// Applies a change of stored shapes, as a commit does.
     fn take(&mut self, collection: &mut Collection, change: Change) {
         self.maps.extend(change.maps);
         for new in &change.relabelled {
@@ -246,7 +246,7 @@ fn empty(n_parts: u32) -> Collection {
     }
 }
 
-/// Relabels stale shapes, the last first if wanted, until none is left.
+/// Relabels stale shapes until none is left, the last first if `backwards`.
 fn settle(memory: &mut Memory, collection: &mut Collection, backwards: bool) {
     for _ in 0..100 {
         let mut stale = (0..collection.shapes.len()).filter(|at| collection.shapes[*at].stale);
@@ -300,7 +300,7 @@ fn a_collection_is_discovered_and_corrected_without_a_store() {
     assert!(memory.newest().into_iter().flatten().all(|l| *l >= 0));
     assert!(!memory.maps.is_empty() && collection.model().is_some());
 
-    // The first shape becomes a training shape; its labels are already those of the person.
+    // The first shape becomes a training shape, whose labels are already those of the person.
     let id = collection.shapes[0].id;
     let truth: Vec<i32> = shapes[0].labels.iter().map(|l| *l as i32 + 10).collect();
     let state = supervised::corrected(&collection, &memory, Vocabulary::Closed).expect("a state");

@@ -1,4 +1,4 @@
-//! What shapes show of the up axis of their collection.
+//! The evidence of shapes about the up axis of their collection.
 
 use crate::description::DescriptionView;
 use crate::labels::{UpVote, contradicting_up, estimate_up};
@@ -14,7 +14,7 @@ pub(in crate::library) struct UpState {
     pub(in crate::library) agreement: f64,
 }
 
-/// What shapes show of the up axis of their collection, and the axis that follows.
+/// The evidence of shapes about the up axis of their collection, and the axis that follows.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::library) struct UpFound {
     /// The axis that is used, if any.
@@ -26,7 +26,7 @@ pub(in crate::library) struct UpFound {
 }
 
 impl UpFound {
-    /// What shapes show where the collection's up axis is `given`.
+    /// Returns the evidence of shapes, if the collection's up axis is `given`.
     pub(in crate::library) fn of<'a>(given: Up, shapes: &[&'a DescriptionView<'a>]) -> Self {
         if given == Up::Auto {
             let vote = estimate_up(shapes.iter().copied());
@@ -56,7 +56,7 @@ impl From<UpVote> for UpState {
 }
 
 impl UpState {
-    /// The estimate as a vote.
+    /// Returns the estimate as a vote.
     pub(in crate::library) fn vote(&self) -> UpVote {
         UpVote {
             axis: self.axis,

@@ -122,7 +122,7 @@ fn a_planted_wrong_map_is_found_and_recomputed() {
     assert!(found.inconsistent && found.departure > 0.5, "{found:?}");
     drop(library);
     let repaired = Library::repair(folder.path()).unwrap();
-    let line = format!("{} to {}: made anew", names.0, names.1);
+    let line = format!("{} to {}: recomputed", names.0, names.1);
     let done = repaired.done.iter().find(|d| d.contains(&line));
     println!("{}", done.unwrap_or_else(|| panic!("{:?}", repaired.done)));
     assert!(
