@@ -1,7 +1,8 @@
-//! Collections become a page to look at: live, served by the daemon, or one HTML file that needs nothing else.
+//! Collections become a page: live, served by the daemon, or one HTML file that needs nothing else.
 //!
-//! [`Pack`] holds arrays, [`portrait`] says which, [`page`] is the HTML. The page itself is `src/viewer/page`: plain
-//! HTML, CSS and JavaScript, joined here, with no library and no build step. docs/viewer.md says what it shows.
+//! [`Pack`] holds arrays, [`portrait`] selects them, and [`page`] makes the HTML. The page itself
+//! is in `src/viewer/page`: plain HTML, CSS and JavaScript without a library or a build step,
+//! joined here. docs/viewer.md describes what it shows.
 
 mod pack;
 pub mod page;

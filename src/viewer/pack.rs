@@ -1,15 +1,16 @@
 //! Arrays become one block of bytes that a page reads without a library: JSON, then raw arrays.
 //!
-//! A pack is a little-endian u32, the length of the JSON text that follows, and, from the next multiple of 8 bytes
-//! on, arrays. The JSON refers to each as `{"type", "shape", "at"}`, quantised ones with `low` and `high` for each
-//! column: the least and the greatest integer of the type stand for these.
+//! A pack is a little-endian u32, the length of the JSON text that follows, and, from the next
+//! multiple of 8 bytes on, arrays. The JSON refers to each as `{"type", "shape", "at"}`. Quantised
+//! arrays also have `low` and `high` for each column: the values of the least and the greatest
+//! integer of the type.
 
 use serde_json::{Value, json};
 
-/// What arrays begin at multiples of.
+/// Alignment of arrays in bytes.
 const ALIGN: usize = 8;
 
-/// Arrays under way into a pack.
+/// A pack under construction.
 #[derive(Debug, Default)]
 pub struct Pack {
     bytes: Vec<u8>,
@@ -24,7 +25,7 @@ impl Pack {
         json!({ "type": kind, "shape": shape, "at": at })
     }
 
-    /// Non-negative integers, in as few bytes as hold the largest.
+    /// Adds non-negative integers, in the smallest type that holds the largest.
     pub fn integers(&mut self, values: &[u32], shape: &[usize]) -> Value {
         let largest = values.iter().copied().max().unwrap_or(0);
         if largest <= u8::MAX.into() {
@@ -42,13 +43,13 @@ impl Pack {
         }
     }
 
-    /// Numbers as they are.
+    /// Adds numbers without quantisation.
     pub fn floats(&mut self, values: &[f32], shape: &[usize]) -> Value {
         let bytes: Vec<u8> = values.iter().flat_map(|&v| v.to_le_bytes()).collect();
         self.push("f32", &bytes, shape)
     }
 
-    /// Rows of numbers in `n_columns` columns, 16 bits each.
+    /// Adds rows of numbers in `n_columns` columns, with 16 bits each.
     pub fn words(&mut self, values: &[f32], n_columns: usize) -> Value {
         let (low, high) = ranges(values, n_columns);
         let steps = quantised(values, &low, &high, f64::from(u16::MAX));
@@ -56,7 +57,7 @@ impl Pack {
         self.ranged("u16", &bytes, values.len(), low, high)
     }
 
-    /// Rows of numbers in `n_columns` columns, 8 bits each.
+    /// Adds rows of numbers in `n_columns` columns, with 8 bits each.
     pub fn octets(&mut self, values: &[f32], n_columns: usize) -> Value {
         let (low, high) = ranges(values, n_columns);
         let bytes: Vec<u8> = quantised(values, &low, &high, f64::from(u8::MAX))
@@ -80,7 +81,7 @@ impl Pack {
         array
     }
 
-    /// The pack, with `header` as its JSON.
+    /// Returns the pack, with `header` as its JSON.
     pub fn finish(self, header: &Value) -> Vec<u8> {
         let text = header.to_string();
         let length = u32::try_from(text.len()).expect("invariant: headers are far below 4 GiB");
@@ -92,7 +93,8 @@ impl Pack {
     }
 }
 
-/// Least and greatest of each column; what is no number counts as 0.
+/// Returns the least and the greatest value of each column. A value that is not a number counts as
+/// 0.
 fn ranges(values: &[f32], n_columns: usize) -> (Vec<f32>, Vec<f32>) {
     let mut low = vec![f32::INFINITY; n_columns];
     let mut high = vec![f32::NEG_INFINITY; n_columns];
@@ -119,7 +121,7 @@ fn quantised<'a>(
         let column = i % low.len();
         let (low, high) = (f64::from(low[column]), f64::from(high[column]));
         let share = (f64::from(value) - low) / (high - low).max(f64::MIN_POSITIVE);
-        // What is no number becomes 0 in the cast.
+        // A value that is not a number becomes 0 in the cast.
         (share.clamp(0.0, 1.0) * steps).round()
     })
 }

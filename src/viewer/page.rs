@@ -1,4 +1,4 @@
-//! The viewer's HTML, live or with everything it shows inside.
+//! Makes the viewer's HTML: live, or with all data inside.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -7,9 +7,9 @@ use flate2::write::GzEncoder;
 use serde_json::Value;
 use std::io::Write as _;
 
-/// The page around styles and scripts.
+/// The page, into which styles and scripts are inserted.
 const FRAME: &str = include_str!("page/page.html");
-/// The viewer's looks.
+/// The viewer's styles.
 pub const STYLE: &str = include_str!("page/style.css");
 /// The viewer's scripts, in the order in which they use each other.
 const SCRIPTS: [&str; 13] = [
@@ -28,24 +28,25 @@ const SCRIPTS: [&str; 13] = [
     include_str!("page/app.js"),
 ];
 
-/// The viewer's program.
+/// Returns the viewer's program.
 pub fn script() -> String {
     SCRIPTS.join("\n")
 }
 
-/// The page as the daemon serves it, beside `viewer.css` and `viewer.js`.
+/// Returns the page that the daemon serves beside `viewer.css` and `viewer.js`.
 pub fn live() -> String {
     let style = r#"<link rel="stylesheet" href="viewer.css">"#;
     let script = r#"<script type="module" src="viewer.js"></script>"#;
     filled(style, "", script)
 }
 
-/// What the page says to the browser: nothing is fetched from anywhere but the page's own origin.
+/// Content security policy of the page: it fetches nothing except from its own origin.
 pub const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:; \
-                          connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
-/// The same for a page that is one file: it can fetch nothing at all.
-const SEALED: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; \
-                      base-uri 'none'; form-action 'none'";
+                          connect-src 'self'; base-uri 'none'; form-action 'none'; \
+                          frame-ancestors 'none'";
+/// Content security policy of a page that is one file: it cannot fetch anything.
+const SEALED: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
+                      img-src data:; base-uri 'none'; form-action 'none'";
 
 fn filled(style: &str, data: &str, script: &str) -> String {
     FRAME
@@ -54,7 +55,8 @@ fn filled(style: &str, data: &str, script: &str) -> String {
         .replace("<!--script-->", script)
 }
 
-/// Packs inside a page, each compressed on its own so that the first shapes are drawn before the last are read.
+/// Packs inside a page. Each is compressed on its own, so that the first shapes are drawn before
+/// the last are read.
 #[derive(Debug, Default)]
 pub struct Embedded {
     elements: Vec<String>,
@@ -64,26 +66,28 @@ impl Embedded {
     /// Adds bytes under a kind (`portraits`, `functions`, `map`) and a key of letters and digits.
     ///
     /// # Errors
-    /// Compressing into memory does not fail; the error is the writer's.
+    /// Compression into memory does not fail; the error type is that of the writer.
     pub fn push(&mut self, kind: &str, key: &str, bytes: &[u8]) -> std::io::Result<()> {
         let mut gzip = GzEncoder::new(Vec::new(), Compression::best());
         gzip.write_all(bytes)?;
         let text = STANDARD.encode(gzip.finish()?);
         self.elements.push(format!(
-            "<script type=\"application/octet-stream\" data-kind=\"{kind}\" data-key=\"{key}\">{text}</script>"
+            "<script type=\"application/octet-stream\" data-kind=\"{kind}\" \
+             data-key=\"{key}\">{text}</script>"
         ));
         Ok(())
     }
 
-    /// The page with `catalogue`, which says what there is, and everything that was added.
+    /// Returns the page with all that was added. `catalogue` lists it.
     pub fn page(&self, catalogue: &Value) -> String {
-        // Within a script element only this could end it; in JSON it means the same.
+        // Only `<` could end the script element; its escape means the same in JSON.
         let json = catalogue.to_string().replace('<', "\\u003c");
         let mut data =
             format!("<script type=\"application/json\" id=\"catalogue\">{json}</script>\n");
         data.push_str(&self.elements.join("\n"));
         let style = format!(
-            "<meta http-equiv=\"Content-Security-Policy\" content=\"{SEALED}\">\n<style>{STYLE}</style>"
+            "<meta http-equiv=\"Content-Security-Policy\" content=\"{SEALED}\">\n\
+             <style>{STYLE}</style>"
         );
         let script = format!("<script type=\"module\">{}</script>", script());
         filled(&style, &data, &script)

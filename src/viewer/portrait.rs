@@ -1,4 +1,5 @@
-//! Shapes become packs that the page draws: meshes with labels, functions on them, maps between them.
+//! Shapes become packs that the page draws: meshes with labels, functions on them, and maps between
+//! them.
 
 use super::pack::Pack;
 use crate::correspondence::parts;
@@ -11,14 +12,15 @@ use crate::segmentation::Surface;
 use bytes::Bytes;
 use serde_json::{Value, json};
 
-/// Triangles beyond which the mesh that was sent is not drawn, and the proxy stands for it.
+/// Maximum number of triangles of a mesh that the page gets; beyond it, the page gets the proxy
+/// only.
 pub const MAX_SURFACE_TRIANGLES: usize = 200_000;
-/// Eigenfunctions that are shown, after the constant one.
+/// Number of eigenfunctions that are shown, after the constant one.
 const N_EIGENFUNCTIONS: usize = 24;
-/// Times at which the heat kernel signature is shown.
+/// Number of times at which the heat kernel signature is shown.
 const N_TIMES: usize = 25;
 
-/// Why a shape cannot be drawn.
+/// The reason why a shape cannot be drawn.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)]
 pub enum PortraitError {
@@ -32,7 +34,7 @@ pub enum PortraitError {
     Unreadable { shape: String, message: String },
 }
 
-/// Labels as positions in a palette of the labels there are.
+/// Returns labels as positions in a palette, and the palette of the labels that occur.
 fn palette(labels: &[i32]) -> (Vec<i32>, Vec<u32>) {
     let mut ids = labels.to_vec();
     ids.sort_unstable();
@@ -45,7 +47,7 @@ fn palette(labels: &[i32]) -> (Vec<i32>, Vec<u32>) {
     (ids, indices)
 }
 
-/// The proxy of a shape with the label and the part of each face; -1: unlabelled.
+/// Packs the proxy of a shape with the label and the part of each face; -1: unlabelled.
 pub fn proxy(
     pack: &mut Pack,
     name: &str,
@@ -70,7 +72,7 @@ pub fn proxy(
     })
 }
 
-/// The mesh that was sent with the labels of its polygons; -1: unlabelled.
+/// Packs the mesh that was sent with the labels of its polygons; -1: unlabelled.
 pub fn surface(
     pack: &mut Pack,
     name: &str,
@@ -94,7 +96,8 @@ pub fn surface(
     if mesh.n_polygons != labels.len() {
         let (n, has) = (mesh.n_polygons, labels.len());
         return Err(unreadable(format!(
-            "it has {n} polygons, but {has} labels, by an earlier release: add it again with --replace"
+            "it has {n} polygons, but {has} labels, by an earlier release: add it \
+             again with --replace"
         )));
     }
     let (positions, triangles) = used(&mesh);
@@ -117,8 +120,8 @@ pub fn surface(
     }))
 }
 
-/// Vertices that triangles use, about their first, and the triangles; single precision does not resolve places far
-/// from the origin.
+/// Returns the vertices that triangles use, relative to the first of them, and the triangles.
+/// Single precision does not resolve positions far from the origin.
 fn used(mesh: &ParsedMesh) -> (Vec<f32>, Vec<u32>) {
     let mut index = vec![u32::MAX; mesh.vertices.len()];
     let (mut positions, mut triangles) = (Vec::new(), Vec::new());
@@ -135,7 +138,7 @@ fn used(mesh: &ParsedMesh) -> (Vec<f32>, Vec<u32>) {
     (positions, triangles)
 }
 
-/// The first eigenfunctions and the heat kernel signature on the proxy.
+/// Packs the first eigenfunctions and the heat kernel signature on the proxy.
 pub fn functions(pack: &mut Pack, name: &str, view: &DescriptionView<'_>) -> Value {
     let n = view.vertices.len();
     let k = view.n_eigenvectors;
@@ -164,10 +167,10 @@ pub fn functions(pack: &mut Pack, name: &str, view: &DescriptionView<'_>) -> Val
     })
 }
 
-/// A functional map with its pointwise map, as the daemon told them.
+/// Packs a functional map with its pointwise map, from the daemon's reply.
 ///
 /// # Errors
-/// The reply's arrays are not what it says.
+/// The reply's arrays do not have the sizes that it states.
 pub fn map(
     from: &str,
     to: &str,

@@ -345,7 +345,7 @@ fault(
     ("            if attempts >= MAX_ATTEMPTS {", "            if attempts >= MAX_ATTEMPTS || FAULT {"),
 )
 fault(
-    "R11", "r11-attempts-in-memory", "count attempts anew after a restart",
+    "R11", "r11-attempts-in-memory", "restart the count of attempts after a restart",
     "src/library/jobs.rs", "it daemon::isolation::attempts_are_counted_across_restarts",
     (
         "            let attempts = self.item(row)?.attempts + 1;\n",

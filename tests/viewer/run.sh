@@ -3,7 +3,7 @@
 #
 #   tests/viewer/run.sh [OUT]     screenshots go to OUT (default: a temporary folder)
 #   COSEG_VIEWER_PICTURES=docs/images tests/viewer/run.sh
-#                                 and makes the pictures of the documents anew
+#                                 and makes the pictures of the documents again
 #   COSEG_VIEWER_SHAPES=400 tests/viewer/run.sh [OUT]
 #                                 and how soon so many chairs appear, live and as a file: COSEG_VIEWER_MS is the limit
 #                                 (2000) for the middle one of three rounds. Labelling 400 takes three

@@ -1,6 +1,10 @@
-// What the page shows becomes its address and back: `#collection/shape/view/detail?search=…&label=…&order=…`.
+// Converts the state of the page to its address and back:
+// `#collection/shape/view/detail?search=…&label=…&order=…`.
 
-/** The views of a shape. A detail belongs to some: the shape a map comes from, an eigenfunction or a time, from 1. */
+/**
+ * The views of a shape. Some have a detail: the shape from which a map comes, or the number of an
+ * eigenfunction or a time, from 1.
+ */
 const VIEWS = ["labels", "eigen", "hks", "map", "history", "correct", "ask"];
 const ORDERS = ["arrival", "name", "doubt", "changed", "moved"];
 const VERDICTS = ["unseen", "corrected", "approved", "doubtful"];
@@ -9,12 +13,12 @@ function decoded(text) {
   try {
     return decodeURIComponent(text);
   } catch {
-    // A person may have typed a lone percent sign.
+    // A person may have typed a percent sign that begins no escape.
     return text;
   }
 }
 
-/** What an address says. What it does not say, or not in words of this page, is null. */
+/** Parses an address. Fields that are missing or unknown are null. */
 function readAddress(hash) {
   const [path, query = ""] = hash.replace(/^#/, "").split(/\?(.*)/s);
   const [collection, shape, view, detail] = path.split("/").map(decoded);

@@ -1,12 +1,19 @@
-// The page as a whole: what is loaded, what is chosen, what changed.
+// The page as a whole: what is loaded, what is selected, what changed.
 
-/** Milliseconds between looks at a live library. */
+/** Milliseconds between polls of a live library. */
 const LOOK_MS = 1_500;
-/** Okabe and Ito's colours, as the library gives them to labels. */
+/** Okabe and Ito's colours, which the library gives to labels. */
 const OKABE_ITO = [
-  [230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [213, 94, 0], [204, 121, 167], [128, 128, 128],
+  [230, 159, 0],
+  [86, 180, 233],
+  [0, 158, 115],
+  [240, 228, 66],
+  [0, 114, 178],
+  [213, 94, 0],
+  [204, 121, 167],
+  [128, 128, 128],
 ];
-/** Colour of what a chosen label does not cover. */
+/** Colour of faces outside the selected label. */
 const DIMMED = [206, 210, 216];
 
 class App {
@@ -35,7 +42,7 @@ class App {
     return this.labels.get(label)?.rgb ?? OKABE_ITO[label] ?? UNLABELLED;
   }
 
-  /** The colour of a label where others may be dimmed. */
+  /** Returns the colour of a label; grey if another label is selected. */
   shownColour(label) {
     return this.only === undefined || this.only === label ? this.colour(label) : DIMMED;
   }
@@ -49,10 +56,14 @@ class App {
     return [...this.labels.values()].filter((l) => l.n_shapes > 0);
   }
 
-  // Data, each asked for once.
+  // Data. Each item is requested once.
 
   async cached(key, ask) {
-    if (!this.cache.has(key)) this.cache.set(key, ask().catch((e) => (this.cache.delete(key), Promise.reject(e))));
+    if (!this.cache.has(key))
+      this.cache.set(
+        key,
+        ask().catch((e) => (this.cache.delete(key), Promise.reject(e))),
+      );
     return this.cache.get(key);
   }
 
@@ -70,7 +81,9 @@ class App {
   }
 
   nearest(name) {
-    return this.cached(`nearest ${name} ${this.shapes.length}`, () => this.source.nearest(this.name, name));
+    return this.cached(`nearest ${name} ${this.shapes.length}`, () =>
+      this.source.nearest(this.name, name),
+    );
   }
 
   async events() {
@@ -80,7 +93,7 @@ class App {
     return this.log;
   }
 
-  /** Shapes from which a map to `name` can be shown, the best first. */
+  /** Returns the shapes from which a map to `name` can be shown, best first. */
   mapSources(name) {
     const inside = this.source.mapSources(name);
     if (inside) return inside;
@@ -95,7 +108,11 @@ class App {
     const library = await this.source.library();
     this.setLibrary(library);
     if (library.collections.length === 0) {
-      this.empty("The library is empty", "Add a folder of meshes, and they appear here as they are labelled.", "coseg add meshes/ --collection chairs");
+      this.empty(
+        "The library is empty",
+        "Add a folder of meshes, and they appear here as they are labelled.",
+        "coseg add meshes/ --collection chairs",
+      );
       document.documentElement.dataset.ready = "empty";
     } else {
       await this.follow();
@@ -113,7 +130,8 @@ class App {
     select.hidden = names.length === 0;
     const edit = this.source.live && library.edit;
     for (const id of ["undo", "redo", "ask", "suggest", "approve"]) $(id).hidden = !edit;
-    for (const mode of ["correct", "ask"]) document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
+    for (const mode of ["correct", "ask"])
+      document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
     this.edit = edit;
   }
 
@@ -145,9 +163,9 @@ class App {
         this.portraits.set(portrait.name, portrait);
         this.gallery.draw(portrait.name);
       }
-      // The shape of the address as soon as it is there.
+      // Opens the shape of the address as soon as it is loaded.
       if (!this.selected && this.portraits.has(this.view.shape)) this.open();
-      // Draw what is in sight before the next batch is read.
+      // Draw the visible shapes before the next batch is read.
       await this.thumbnails.idle();
     }
     if (this.loading !== ticket) return;
@@ -167,18 +185,25 @@ class App {
     this.legend.show();
     this.warnOfUp();
     $("undo").disabled = !collection.n_undoable;
-    $("undo").title = collection.n_undoable ? "Take back the newest change by a person" : "Nothing to undo: nobody has changed anything";
+    $("undo").title = collection.n_undoable
+      ? "Take back the newest change by a person"
+      : "Nothing to undo: nobody has changed anything";
     this.filter();
     if (shapes.length === 0)
-      this.empty("No shapes yet", "Shapes appear here as they are labelled.", `coseg add meshes/ --collection ${collection.name}`);
+      this.empty(
+        "No shapes yet",
+        "Shapes appear here as they are labelled.",
+        `coseg add meshes/ --collection ${collection.name}`,
+      );
     else this.empty();
   }
 
-  /** Notes when all pictures that are in sight are there: milliseconds since the page was asked for. */
+  /** Records when all visible pictures are drawn: milliseconds since the page was requested. */
   thumbnailsDrawn() {
     const root = document.documentElement;
     const inSight = [...this.gallery.cards.values()].filter((c) => c.inSight);
-    const someShown = inSight.length > 0 || this.found.length === 0 || this.gallery.root.clientHeight === 0;
+    const someShown =
+      inSight.length > 0 || this.found.length === 0 || this.gallery.root.clientHeight === 0;
     if (!someShown || !inSight.every((c) => c.firstChild.dataset.drawn)) return;
     root.dataset.visibleMs ??= Math.round(performance.now());
     if (this.loaded) root.dataset.ready = "true";
@@ -189,10 +214,13 @@ class App {
   filter() {
     this.filtered = writeAddress({ ...this.view, collection: null, shape: null });
     const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
-    const names = (s) => `${s.name} ${s.parts.map((p) => this.labelName(p.label)).join(" ")}`.toLowerCase();
+    const names = (s) =>
+      `${s.name} ${s.parts.map((p) => this.labelName(p.label)).join(" ")}`.toLowerCase();
     let found = this.shapes.filter((s) => words.every((w) => names(s).includes(w)));
-    if (this.only !== undefined) found = found.filter((s) => s.parts.some((p) => p.label === this.only));
-    if (this.view.review) found = found.filter((s) => (s.review?.state ?? "unseen") === this.view.review);
+    if (this.only !== undefined)
+      found = found.filter((s) => s.parts.some((p) => p.label === this.only));
+    if (this.view.review)
+      found = found.filter((s) => (s.review?.state ?? "unseen") === this.view.review);
     const orders = {
       moved: (a, b) => this.changes.moved(b.name) - this.changes.moved(a.name),
       name: (a, b) => a.name.localeCompare(b.name, "en", { numeric: true }),
@@ -206,12 +234,18 @@ class App {
     const all = this.nStored;
     const approved = this.shapes.filter((s) => s.review?.state === "approved").length;
     const verdicts = approved ? `, ${approved} approved` : "";
-    $("count").textContent = (found.length === all ? counted(all, "shape") : `${found.length} of ${counted(all, "shape")}`) + verdicts;
-    if (this.shapes.length && found.length === 0) this.empty("Nothing found", "No shape has this name or label.");
+    $("count").textContent =
+      (found.length === all
+        ? counted(all, "shape")
+        : `${found.length} of ${counted(all, "shape")}`) + verdicts;
+    if (this.shapes.length && found.length === 0)
+      this.empty("Nothing found", "No shape has this name or label.");
     else if (this.shapes.length) this.empty();
   }
 
-  /** Says if shapes seem to stand along another axis than the collection's, and what to do about it. */
+  /**
+   * Warns if shapes seem to stand along another axis than the collection's, and says what to do.
+   */
   warnOfUp() {
     const { about } = this;
     const other = about.up_disagrees;
@@ -220,13 +254,19 @@ class App {
     const word = /^[\p{L}\p{N}_.][\p{L}\p{N}_.-]*$/u.test(about.name);
     const name = word ? about.name : `'${about.name.replaceAll("'", "'\\''")}'`;
     $("warning").replaceChildren(
-      `This collection was given up ${about.up}, but ${percent(other.agreement)} of the shapes that were clustered last stand along ${other.up}. If they do, this finds the labels again: `,
-      make("code", {}, `coseg collections set ${name} --up ${other.up}`));
+      `This collection was given up ${about.up}, but ${percent(other.agreement)} of the shapes ` +
+        `that were clustered last stand along ${other.up}. ` +
+        "If they do, this finds the labels again: ",
+      make("code", {}, `coseg collections set ${name} --up ${other.up}`),
+    );
   }
 
-  // Where the page is. Everything that is chosen goes through the address, so that Back, Forward and a link do it too.
+  // The state of the page. Every selection goes through the address, so that Back, Forward and
+  // links restore it.
 
-  /** Goes where the changes lead from here: a new entry of the history, or another address for this one. */
+  /**
+   * Goes to the address with these changes, as a new entry of the history or in place of this one.
+   */
   go(changes, { replace = false } = {}) {
     const address = writeAddress({ ...this.view, ...changes });
     if (address === writeAddress(this.view)) return this.follow();
@@ -235,18 +275,21 @@ class App {
     return this.follow();
   }
 
-  /** Shows what the address says. */
+  /** Shows the state that the address describes. */
   async follow() {
     const { stage } = this;
     const view = readAddress(location.hash);
     const names = this.library.collections.map((c) => c.name);
     const unknown = view.collection && !names.includes(view.collection) ? view.collection : null;
-    if (!names.includes(view.collection)) Object.assign(view, { collection: names[0], shape: null, label: null });
+    if (!names.includes(view.collection))
+      Object.assign(view, { collection: names[0], shape: null, label: null });
     const tab = document.querySelector(`[data-mode="${view.view}"]:not([hidden])`);
     if (view.shape && !tab) Object.assign(view, { view: "labels", detail: null });
-    const stays = view.collection === this.name && view.shape === this.selected && view.view === stage.mode;
+    const stays =
+      view.collection === this.name && view.shape === this.selected && view.view === stage.mode;
     if (stage.painted.size && !stays) {
-      if (!confirm("Discard what is painted?")) return history.pushState(null, "", writeAddress(this.view));
+      if (!confirm("Discard what is painted?"))
+        return history.pushState(null, "", writeAddress(this.view));
       stage.painted.clear();
     }
     this.view = view;
@@ -267,7 +310,7 @@ class App {
     await this.open();
   }
 
-  /** Draws all shapes again, in other colours. */
+  /** Draws all shapes again in other colours. */
   recolour() {
     this.gallery.redraw();
     if (!this.stage.scenes?.length) return;
@@ -277,14 +320,18 @@ class App {
 
   // One shape.
 
-  /** Shows the shape of the address, once it is loaded; closes the stage if there is none. */
+  /** Shows the shape of the address once it is loaded, or closes the stage if there is none. */
   async open() {
     const { stage, view } = this;
     const { shape } = view;
     if (!shape) return this.close();
     if (!this.portraits.has(shape)) {
       if (this.loaded) {
-        this.toast(`There is no shape “${shape}” in ${this.name}${this.byName.has(shape) ? " that is loaded" : ""}.`, true);
+        this.toast(
+          `There is no shape “${shape}” in ${this.name}` +
+            `${this.byName.has(shape) ? " that is loaded" : ""}.`,
+          true,
+        );
         await this.go({ shape: null }, { replace: true });
       }
       return;
@@ -300,10 +347,15 @@ class App {
     this.gallery.select(shape);
     this.showTabs();
     // A narrow page has no room for the cards beside the shape.
-    if (another && document.activeElement?.closest("#gallery") && this.gallery.root.clientHeight === 0) this.tab().focus();
+    if (
+      another &&
+      document.activeElement?.closest("#gallery") &&
+      this.gallery.root.clientHeight === 0
+    )
+      this.tab().focus();
     if (other) {
       this.panel.show(shape);
-      // What the view is about is at the top of it.
+      // The controls of the view are at the top.
       this.panel.root.scrollTop = 0;
     }
     if (another) await stage.show(shape);
@@ -337,22 +389,31 @@ class App {
   step(by) {
     const at = this.found.findIndex((s) => s.name === this.selected);
     const next = this.found[(at + by + this.found.length) % this.found.length];
-    if (next) this.go({ shape: next.name, detail: this.stage.mode === "map" ? null : this.view.detail });
+    if (next)
+      this.go({ shape: next.name, detail: this.stage.mode === "map" ? null : this.view.detail });
   }
 
   async correct() {
     const { stage } = this;
     const shape = this.shape(this.selected);
-    const body = { collection: this.name, shape: shape.name, n_polygons: shape.n_polygons, runs: stage.runs() };
+    const body = {
+      collection: this.name,
+      shape: shape.name,
+      n_polygons: shape.n_polygons,
+      runs: stage.runs(),
+    };
     await this.attempt(async () => {
       const done = await this.changes.send("correct", body);
       stage.painted.clear();
-      this.toast(`${percent(done.area_share)} of ${shape.name} is labelled by hand; ${followers(done, shape)}.`);
+      this.toast(
+        `${percent(done.area_share)} of ${shape.name} is labelled by hand; ` +
+          `${followers(done, shape)}.`,
+      );
       await this.reload();
     });
   }
 
-  /** Takes the shape's labels as right, all of them. */
+  /** Approves all labels of the shape. */
   approve() {
     const shape = this.shape(this.selected);
     if (!shape || !this.edit || this.stage.painted.size) return;
@@ -386,10 +447,16 @@ class App {
 
   toast(text, bad = false) {
     const toast = make("div", { className: bad ? "toast bad" : "toast" }, text);
-    // Over the shapes, so that nothing that can be pressed is under it.
-    const box = ($("stage").hidden ? $("main") : document.querySelector(".scene")).getBoundingClientRect();
-    const room = { left: box.left + 14, bottom: window.innerHeight - Math.min(box.bottom, window.innerHeight) + 14 };
-    for (const [side, pixels] of Object.entries(room)) $("toasts").style[side] = `${Math.round(pixels)}px`;
+    // Above the shapes, so that it covers nothing that can be pressed.
+    const box = (
+      $("stage").hidden ? $("main") : document.querySelector(".scene")
+    ).getBoundingClientRect();
+    const room = {
+      left: box.left + 14,
+      bottom: window.innerHeight - Math.min(box.bottom, window.innerHeight) + 14,
+    };
+    for (const [side, pixels] of Object.entries(room))
+      $("toasts").style[side] = `${Math.round(pixels)}px`;
     $("toasts").append(toast);
     setTimeout(() => toast.remove(), bad ? 9_000 : 5_000);
   }
@@ -419,15 +486,20 @@ class App {
   }
 
   differs(now) {
-    return ["sequence", "n_shapes", "n_stale", "n_undoable"].some((key) => now[key] !== this.about[key]);
+    return ["sequence", "n_shapes", "n_stale", "n_undoable"].some(
+      (key) => now[key] !== this.about[key],
+    );
   }
 
-  /** Takes over what changed, and draws only that anew. */
+  /** Loads what changed, and redraws only that. */
   async reload() {
     const found = await this.source.collection(this.name);
     this.setCollection(found);
-    for (const name of this.portraits.keys()) if (!this.byName.has(name)) this.portraits.delete(name);
-    const changed = this.shapes.filter((s) => this.portraits.get(s.name)?.version !== s.version).map((s) => s.name);
+    for (const name of this.portraits.keys())
+      if (!this.byName.has(name)) this.portraits.delete(name);
+    const changed = this.shapes
+      .filter((s) => this.portraits.get(s.name)?.version !== s.version)
+      .map((s) => s.name);
     for (let i = 0; i < changed.length; i += 16)
       for (const portrait of await this.source.portraitsOf(this.name, changed.slice(i, i + 16))) {
         this.changes.replaced(this.portraits.get(portrait.name));
@@ -441,7 +513,8 @@ class App {
     if (!this.byName.has(selected)) return this.go({ shape: null }, { replace: true });
     this.panel.show(selected);
     const shown = ["labels", "history", "correct", "ask"].includes(this.stage.mode);
-    if (changed.includes(selected) && shown && this.stage.painted.size === 0) await this.stage.refresh();
+    if (changed.includes(selected) && shown && this.stage.painted.size === 0)
+      await this.stage.refresh();
     else this.panel.showControls();
   }
 
@@ -449,13 +522,18 @@ class App {
     $("search").oninput = () => this.go({ search: $("search").value }, { replace: true });
     $("order").onchange = () => this.go({ order: $("order").value }, { replace: true });
     $("collections").onchange = () =>
-      this.attempt(() => this.go({ collection: $("collections").value, shape: null, label: null, search: "" }));
+      this.attempt(() =>
+        this.go({ collection: $("collections").value, shape: null, label: null, search: "" }),
+      );
     $("close").onclick = () => this.go({ shape: null });
     $("previous").onclick = () => this.step(-1);
     $("next").onclick = () => this.step(1);
-    $("skip").onfocus = () => ($("skip").textContent = this.selected ? "Skip to the shape" : "Skip to the shapes");
-    $("skip").onclick = () => (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
-    $("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
+    $("skip").onfocus = () =>
+      ($("skip").textContent = this.selected ? "Skip to the shape" : "Skip to the shapes");
+    $("skip").onclick = () =>
+      (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
+    $("theme").onclick = () =>
+      setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
     $("review").onchange = () => this.go({ review: $("review").value || null }, { replace: true });
     $("undo").onclick = () => this.changes.undo();
     $("redo").onclick = () => this.changes.redo();
@@ -477,7 +555,7 @@ class App {
     window.addEventListener("resize", () => this.gallery.redraw());
   }
 
-  /** Keys that mean the same wherever the focus is, but for fields. */
+  /** Handles keys that mean the same wherever the focus is, except in fields. */
   key(event) {
     if (/INPUT|SELECT|TEXTAREA/.test(event.target.tagName) || event.defaultPrevented) return;
     if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
@@ -502,7 +580,10 @@ class App {
   }
 }
 
-/** How many other shapes follow a correction of this one, which may wait itself. */
+/**
+ * Returns the number of other shapes that wait for a correction of this one. The shape may wait
+ * itself.
+ */
 function followers(done, shape) {
   const n = done.n_stale - (done.n_faces < shape.n_polygons ? 1 : 0);
   return `${counted(n, "other shape")} ${n === 1 ? "follows" : "follow"}`;
@@ -518,7 +599,7 @@ function setTheme(theme, keep) {
   try {
     if (keep) localStorage.setItem("coseg-theme", theme);
   } catch {
-    // A file may not keep anything.
+    // A page that is a file may have no storage.
   }
 }
 
@@ -527,7 +608,7 @@ function wantedTheme() {
     const kept = localStorage.getItem("coseg-theme");
     if (kept) return kept;
   } catch {
-    // As above.
+    // A page that is a file may have no storage.
   }
   return matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 }
@@ -539,7 +620,10 @@ try {
   await app.start();
 } catch (error) {
   $("empty").hidden = false;
-  $("empty").replaceChildren(make("h2", {}, "The viewer cannot start"), make("div", {}, error.message));
+  $("empty").replaceChildren(
+    make("h2", {}, "The viewer cannot start"),
+    make("div", {}, error.message),
+  );
   document.documentElement.dataset.ready = "failed";
   throw error;
 }

@@ -1,6 +1,6 @@
-// Questions to a person: one part at a time, one key an answer.
+// Asks a person questions: one part at a time, one key for each answer.
 
-/** Keys of the likeliest labels. */
+/** Keys of the most likely labels. */
 const ANSWER_KEYS = ["1", "2", "3"];
 
 class Asker {
@@ -9,7 +9,7 @@ class Asker {
     this.question = null;
   }
 
-  /** Whether the shape is the one that is asked about. */
+  /** Returns whether this is the shape that the question is about. */
   asks(shape) {
     return this.question?.shape === shape;
   }
@@ -27,21 +27,29 @@ class Asker {
     $("controls").dataset.question = `${question.shape}:${question.part}`;
   }
 
-  /** Sends an answer and asks on: `{label}`, `{named}`, `{skip}` or `{cut_wrongly}`. */
+  /**
+   * Sends an answer and fetches the next question: `{label}`, `{named}`, `{skip}` or
+   * `{cut_wrongly}`.
+   */
   answer(answer) {
     const { app, question } = this;
     if (!question || this.busy) return;
     this.busy = true;
     return app.attempt(async () => {
       try {
-        const body = { collection: app.name, shape: question.shape, part: question.part, ...answer };
+        const body = {
+          collection: app.name,
+          shape: question.shape,
+          part: question.part,
+          ...answer,
+        };
         if (answer.skip || answer.cut_wrongly) await app.source.change("answer", body);
         else await app.changes.send("answer", body);
         await this.next();
       } finally {
         this.busy = false;
       }
-      // The next question can be answered meanwhile.
+      // Meanwhile the next question can be answered.
       await app.reload();
     });
   }
@@ -51,15 +59,28 @@ class Asker {
     if (!question || !this.asks(app.selected)) {
       const ask = make("button", { className: "primary", id: "ask-here" }, "Ask the next question");
       ask.onclick = () => app.attempt(() => this.next());
-      return box.replaceChildren(ask, make("span", { className: "quiet" }, "the part whose label is worth most comes first"));
+      return box.replaceChildren(
+        ask,
+        make("span", { className: "quiet" }, "the part whose label is worth most comes first"),
+      );
     }
     const buttons = question.likeliest.map((offered, i) => {
-      const button = make("button", { "data-answer": i + 1, title: `${percent(offered.probability)} probable` },
-        make("kbd", {}, ANSWER_KEYS[i]), swatch(app.colour(offered.label)), app.labelName(offered.label));
+      const button = make(
+        "button",
+        { "data-answer": i + 1, title: `${percent(offered.probability)} probable` },
+        make("kbd", {}, ANSWER_KEYS[i]),
+        swatch(app.colour(offered.label)),
+        app.labelName(offered.label),
+      );
       button.onclick = () => this.answer({ label: offered.label });
       return button;
     });
-    const name = make("input", { placeholder: "another label, or a new one", maxLength: 128, "aria-label": "Name of the label", id: "ask-name" });
+    const name = make("input", {
+      placeholder: "another label, or a new one",
+      maxLength: 128,
+      "aria-label": "Name of the label",
+      id: "ask-name",
+    });
     name.setAttribute("list", "ask-names");
     const names = make("datalist", { id: "ask-names" },
       ...app.labelsInUse().filter((l) => l.name).map((l) => make("option", { value: l.name })));
@@ -77,10 +98,15 @@ class Asker {
     cut.onclick = () => this.answer({ cut_wrongly: true });
     box.replaceChildren(
       make("span", {}, `Which label has the bright part? (${question.n_answered} answered)`),
-      make("div", { className: "palette" }, ...buttons), make("label", {}, make("kbd", {}, "n"), name), names, skip, cut);
+      make("div", { className: "palette" }, ...buttons),
+      make("label", {}, make("kbd", {}, "n"), name),
+      names,
+      skip,
+      cut,
+    );
   }
 
-  /** Takes a key; true if it meant something. */
+  /** Handles a key; returns whether it has a meaning here. */
   key(key) {
     if (!this.asks(this.app.selected)) return false;
     const offered = this.question.likeliest[ANSWER_KEYS.indexOf(key)];

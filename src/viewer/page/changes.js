@@ -1,4 +1,5 @@
-// What a person changes from this page: sent, undone, done again, and what came of the newest change.
+// Changes that a person makes on this page: sends, undoes and repeats them, and shows their
+// progress.
 
 class Changes {
   constructor(app) {
@@ -6,7 +7,7 @@ class Changes {
     this.forget();
   }
 
-  /** Another collection is shown. */
+  /** Forgets the changes, because another collection is shown. */
   forget() {
     this.made = [];
     this.undone = [];
@@ -14,7 +15,7 @@ class Changes {
     this.shows = "after";
   }
 
-  /** Sends a change, and remembers it. */
+  /** Sends a change and records it. */
   async send(path, body, redo = false) {
     const { app } = this;
     const since = app.about.sequence;
@@ -26,7 +27,7 @@ class Changes {
     return done;
   }
 
-  /** Takes back a stroke that was not sent yet, else the newest change by a person. */
+  /** Undoes a stroke that was not sent yet, or else the newest change by a person. */
   undo() {
     const { app } = this;
     if (app.stage.mode === "correct" && app.stage.stroke(false)) return;
@@ -39,12 +40,15 @@ class Changes {
       else [this.made, this.undone] = [[], []];
       this.newest = { since, portraits: new Map(), moved: new Map() };
       const subject = undone.subject ? ` of ${undone.subject}` : "";
-      app.toast(`Undone: ${undone.change}${subject}. ${counted(undone.n_left, "change")} before it can be undone.`);
+      app.toast(
+        `Undone: ${undone.change}${subject}. ` +
+          `${counted(undone.n_left, "change")} before it can be undone.`,
+      );
       await app.reload();
     });
   }
 
-  /** Does again what was taken back last. */
+  /** Repeats the change that was undone last. */
   redo() {
     const { app } = this;
     if (app.stage.mode === "correct" && app.stage.stroke(true)) return;
@@ -57,23 +61,24 @@ class Changes {
     });
   }
 
-  /** Notes the portrait that a shape had before the newest change. */
+  /** Records the portrait that a shape had before the newest change. */
   replaced(portrait) {
     const { newest } = this;
-    if (newest && portrait && !newest.portraits.has(portrait.name)) newest.portraits.set(portrait.name, portrait);
+    if (newest && portrait && !newest.portraits.has(portrait.name))
+      newest.portraits.set(portrait.name, portrait);
   }
 
-  /** The portrait that is to be shown in place of the present one. */
+  /** Returns the portrait that is to be shown instead of the present one. */
   before(name) {
     return this.shows === "before" ? this.newest?.portraits.get(name) : undefined;
   }
 
-  /** Share of a shape's area that the newest change moved. */
+  /** Returns the share of a shape's area that the newest change moved. */
   moved(name) {
     return this.newest?.moved.get(name) ?? 0;
   }
 
-  /** Says what came of the newest change so far. */
+  /** Shows the progress of the newest change. */
   async show() {
     const { app, newest } = this;
     const box = $("effect");
@@ -87,21 +92,43 @@ class Changes {
       newest.moved.set(e.shape, Math.min(this.moved(e.shape) + share, 1));
     }
     const n = [...newest.moved.values()].filter((share) => share > 0).length;
-    const all = [...newest.moved.values()].reduce((sum, share) => sum + share, 0) / Math.max(app.shapes.length, 1);
+    const all =
+      [...newest.moved.values()].reduce((sum, share) => sum + share, 0) /
+      Math.max(app.shapes.length, 1);
     const waiting = app.about.n_stale;
-    const first = make("button", { id: "moved-first", "aria-pressed": String(app.view.order === "moved") }, "Changed first");
-    first.onclick = () => app.go({ order: app.view.order === "moved" ? "arrival" : "moved" }, { replace: true });
-    const toggle = make("button", { id: "before", "aria-pressed": String(this.shows === "before") }, make("kbd", {}, "v"), "Before");
+    const first = make(
+      "button",
+      { id: "moved-first", "aria-pressed": String(app.view.order === "moved") },
+      "Changed first",
+    );
+    first.onclick = () =>
+      app.go({ order: app.view.order === "moved" ? "arrival" : "moved" }, { replace: true });
+    const toggle = make(
+      "button",
+      { id: "before", "aria-pressed": String(this.shows === "before") },
+      make("kbd", {}, "v"),
+      "Before",
+    );
     toggle.onclick = () => this.toggle();
-    const close = make("button", { className: "plain", id: "effect-close", "aria-label": "Close", title: "Close" }, "✕");
+    const close = make(
+      "button",
+      { className: "plain", id: "effect-close", "aria-label": "Close", title: "Close" },
+      "✕",
+    );
     close.onclick = () => {
       this.newest = null;
       this.toggle("after");
       this.show();
     };
     const wait = waiting ? `; ${counted(waiting, "shape")} to come` : "";
-    keepingFocus(box, () => box.replaceChildren(
-      `Your last change moved ${percent(all)} of the area, on ${counted(n, "shape")}${wait}. `, first, toggle, close));
+    keepingFocus(box, () =>
+      box.replaceChildren(
+        `Your last change moved ${percent(all)} of the area, on ${counted(n, "shape")}${wait}. `,
+        first,
+        toggle,
+        close,
+      ),
+    );
   }
 
   toggle(shows = this.shows === "before" ? "after" : "before") {
@@ -112,8 +139,10 @@ class Changes {
   }
 }
 
-/** Whether what was undone on the library is this change. */
+/** Returns whether this change is the one that was undone in the library. */
 function isOf(made, undone) {
-  const kinds = { correct: ["correct"], answer: ["answer"], review: ["approve", "doubt"] }[made.path] ?? [made.path];
+  const kinds = { correct: ["correct"], answer: ["answer"], review: ["approve", "doubt"] }[
+    made.path
+  ] ?? [made.path];
   return kinds.includes(undone.change) && (!made.body.shape || made.body.shape === undone.subject);
 }

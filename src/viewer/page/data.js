@@ -1,8 +1,8 @@
-// Where shapes come from: the daemon that serves this page, or packs inside the file itself.
+// Reads shapes from the daemon that serves this page, or from packs inside the file itself.
 
 const TYPES = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f32: Float32Array };
 
-/** A pack's JSON with its arrays in the places where it refers to them. */
+/** Returns a pack's JSON with references replaced by arrays. */
 function readPack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const base = Math.ceil((4 + length) / 8) * 8;
@@ -16,7 +16,7 @@ function readPack(buffer) {
   });
 }
 
-/** Numbers of a quantised array, row by row. */
+/** Returns the numbers of a quantised array, row by row. */
 function numbers(array) {
   const { data, low, high } = array;
   const columns = low.length;
@@ -27,7 +27,7 @@ function numbers(array) {
   return out;
 }
 
-/** One column of a quantised array. */
+/** Returns one column of a quantised array. */
 function column(array, at) {
   const { data, low, high } = array;
   const columns = array.shape[1];
@@ -38,7 +38,7 @@ function column(array, at) {
   return out;
 }
 
-/** Bytes that are written in base 64. */
+/** Decodes base 64. */
 function bytesOf(text) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
   const words = atob(text);
@@ -48,11 +48,13 @@ function bytesOf(text) {
 }
 
 async function unpacked(element) {
-  const stream = new Blob([bytesOf(element.textContent)]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const stream = new Blob([bytesOf(element.textContent)])
+    .stream()
+    .pipeThrough(new DecompressionStream("gzip"));
   return readPack(await new Response(stream).arrayBuffer());
 }
 
-/** Everything inside this file. Nothing can be changed. */
+/** Reads everything from this file. Nothing can be changed. */
 class EmbeddedSource {
   constructor(element) {
     this.live = false;
@@ -63,14 +65,18 @@ class EmbeddedSource {
   }
 
   async library() {
-    return { version: this.catalogue.version, edit: false, collections: [this.catalogue.collection] };
+    return {
+      version: this.catalogue.version,
+      edit: false,
+      collections: [this.catalogue.collection],
+    };
   }
 
   async collection() {
     return this.catalogue;
   }
 
-  /** Portraits in batches, as soon as each is there. */
+  /** Yields portraits in batches, each as soon as it is read. */
   async *portraits() {
     for (let i = 0; this.elements.has(`portraits ${i}`); i++) {
       const element = this.elements.get(`portraits ${i}`);
@@ -82,11 +88,13 @@ class EmbeddedSource {
   async functions(_, shape) {
     const at = this.catalogue.functions.indexOf(shape);
     if (at < 0)
-      throw new Error("Left out of this file. Write it with --functions N to have more shapes with functions.");
+      throw new Error(
+        "Left out of this file. Write it with --functions N to have more shapes with functions.",
+      );
     return (await unpacked(this.elements.get(`functions ${at}`))).shapes[0];
   }
 
-  /** The shapes from which there is a map to `shape`. */
+  /** Returns the shapes from which there is a map to `shape`. */
   mapSources(shape) {
     return this.catalogue.maps.filter((m) => m[1] === shape).map((m) => m[0]);
   }
@@ -106,7 +114,7 @@ class EmbeddedSource {
   }
 }
 
-/** The daemon that serves this page. */
+/** Reads from the daemon that serves this page. */
 class LiveSource {
   constructor() {
     this.live = true;
@@ -129,7 +137,11 @@ class LiveSource {
 
   async change(path, body) {
     const headers = { "content-type": "application/json", "x-coseg": "1" };
-    const response = await fetch(`api/${path}`, { method: "POST", headers, body: JSON.stringify(body) });
+    const response = await fetch(`api/${path}`, {
+      method: "POST",
+      headers,
+      body: JSON.stringify(body),
+    });
     if (!response.ok) throw new Error(await refusal(response));
     return response.json();
   }
@@ -143,7 +155,7 @@ class LiveSource {
   }
 
   async *portraits(collection, shapes) {
-    // Few at first, so that something is there at once.
+    // The first batch is small, so that something appears at once.
     let size = 12;
     let after = 0;
     const last = shapes.at(-1)?.ordinal ?? 0;
@@ -159,7 +171,7 @@ class LiveSource {
     }
   }
 
-  /** Portraits of a few shapes that changed. */
+  /** Returns the portraits of a few shapes that changed. */
   async portraitsOf(collection, names) {
     const parameters = [["collection", collection], ...names.map((name) => ["shape", name])];
     return (await this.pack("portraits", parameters)).shapes;

@@ -1,4 +1,4 @@
-// Triangles become pictures, with WebGL 2.
+// Draws triangles with WebGL 2.
 
 const VERTEX = `#version 300 es
 uniform mat3 turn;
@@ -25,7 +25,8 @@ void main() {
   level = value;
 }`;
 
-// Light from above right and a weaker one from the left, both moving with the viewer; both sides are lit.
+// A light from the upper right and a weaker one from the left move with the viewer; both sides of a
+// face are lit.
 const FRAGMENT = `#version 300 es
 precision highp float;
 uniform float contours;
@@ -44,7 +45,8 @@ void main() {
   float key = max(dot(n, normalize(vec3(0.45, 0.75, 0.65))), 0.0);
   float fill = max(dot(n, normalize(vec3(-0.8, 0.1, 0.5))), 0.0);
   float sky = 0.5 + 0.5 * n.y;
-  vec3 light = vec3(0.30) + 0.16 * sky * vec3(0.9, 0.97, 1.1) + 0.62 * key * vec3(1.03, 1.0, 0.95) + 0.16 * fill;
+  vec3 light = vec3(0.30) + 0.16 * sky * vec3(0.9, 0.97, 1.1)
+    + 0.62 * key * vec3(1.03, 1.0, 0.95) + 0.16 * fill;
   vec3 halfway = normalize(normalize(vec3(0.45, 0.75, 0.65)) + eye);
   float gloss = 0.06 * pow(max(dot(n, halfway), 0.0), 28.0);
   float rim = 0.10 * pow(1.0 - max(dot(n, eye), 0.0), 3.0);
@@ -63,7 +65,7 @@ void main() {
   pixel = vec4(pow(lit, vec3(1.0 / 2.2)), 1.0);
 }`;
 
-/** From where a shape is seen, and where on the screen it is; pixels of a box. */
+/** The direction from which a shape is seen, and its position on the screen, in pixels of a box. */
 class View {
   constructor() {
     this.yaw = 0.6;
@@ -74,7 +76,12 @@ class View {
   }
 
   get turn() {
-    const [sy, cy, sp, cp] = [Math.sin(this.yaw), Math.cos(this.yaw), Math.sin(this.pitch), Math.cos(this.pitch)];
+    const [sy, cy, sp, cp] = [
+      Math.sin(this.yaw),
+      Math.cos(this.yaw),
+      Math.sin(this.pitch),
+      Math.cos(this.pitch),
+    ];
     // Rows: right, up, towards the viewer.
     return [cy, 0, -sy, -sp * sy, cp, -sp * cy, cp * sy, sp, cp * cy];
   }
@@ -85,7 +92,10 @@ class View {
     return [size / width, size / height];
   }
 
-  /** Of each point of the shape (x, y, z) pixels from the upper left corner of the box, and nearness. */
+  /**
+   * Returns, for each point of the shape, (x, y, z): pixels from the upper left corner of the box,
+   * and nearness.
+   */
   project(points) {
     const t = this.turn;
     const [sx, sy] = this.scale;
@@ -103,7 +113,10 @@ class View {
     return out;
   }
 
-  /** Fills the box with meshes, one in the place of another, as they are seen now. */
+  /**
+   * Scales and centres meshes, which are drawn in the same place, to fill the box in the present
+   * direction.
+   */
   fit(meshes) {
     [this.zoom, this.pan] = [1, [0, 0]];
     let [left, right, top, bottom] = [Infinity, -Infinity, Infinity, -Infinity];
@@ -130,7 +143,12 @@ class View {
 class Renderer {
   constructor(canvas) {
     this.canvas = canvas;
-    const options = { antialias: true, alpha: true, premultipliedAlpha: true, preserveDrawingBuffer: true };
+    const options = {
+      antialias: true,
+      alpha: true,
+      premultipliedAlpha: true,
+      preserveDrawingBuffer: true,
+    };
     const gl = canvas.getContext("webgl2", options);
     if (!gl) throw new Error("This browser has no WebGL 2, or it is switched off.");
     this.gl = gl;
@@ -139,20 +157,27 @@ class Renderer {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS))
+        throw new Error(gl.getShaderInfoLog(shader));
       gl.attachShader(program, shader);
     }
-    ["place", "normal", "colour", "border", "value"].forEach((name, i) => gl.bindAttribLocation(program, i, name));
+    ["place", "normal", "colour", "border", "value"].forEach((name, i) =>
+      gl.bindAttribLocation(program, i, name),
+    );
     gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+      throw new Error(gl.getProgramInfoLog(program));
     this.uniform = Object.fromEntries(
-      ["turn", "scale", "shift", "contours", "lines"].map((name) => [name, gl.getUniformLocation(program, name)]),
+      ["turn", "scale", "shift", "contours", "lines"].map((name) => [
+        name,
+        gl.getUniformLocation(program, name),
+      ]),
     );
     gl.useProgram(program);
     gl.enable(gl.DEPTH_TEST);
   }
 
-  /** Puts a mesh on the graphics card. */
+  /** Copies a mesh to the graphics card. */
   upload(mesh) {
     const { gl } = this;
     const { place, normal } = mesh.corners();
@@ -175,7 +200,7 @@ class Renderer {
     return { mesh, array, buffers, nCorners };
   }
 
-  /** Replaces colours, borders or values of what was uploaded. */
+  /** Replaces colours, borders or values of an uploaded mesh. */
   update(uploaded, name, data) {
     const { gl } = this;
     gl.bindBuffer(gl.ARRAY_BUFFER, uploaded.buffers[name]);

@@ -1,27 +1,39 @@
-// All shapes in the colours of their labels, drawn when they come into sight.
+// Shows all shapes in the colours of their labels, and draws each when it becomes visible.
 
 /**
- * Milliseconds of a frame that drawing small pictures may take. Without a graphics card a frame costs far more than the
- * pictures in it, so there should be few.
+ * Milliseconds that drawing small pictures may take in a frame. Without a graphics card, a frame
+ * costs far more than its pictures, so there should be few frames.
  */
 const BUDGET_MS = 150;
-/** Milliseconds for which reading waits for drawing. */
+/** Maximum number of milliseconds for which reading waits for drawing. */
 const PATIENCE_MS = 500;
 const $ = (id) => document.getElementById(id);
 
-/** Characters that show nothing of themselves or turn the direction of others, as src/library/names.rs has them. */
-const HIDDEN =
-  /[\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\u3164\ufeff\uffa0\ufff0-\ufffb\u{1d173}-\u{1d17a}\u{e0000}-\u{e007f}]/gu;
+/**
+ * Characters that are invisible or turn the direction of others; the same as in
+ * src/library/names.rs.
+ */
+const HIDDEN = new RegExp(
+  String.raw`[\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180e\u200b\u200e\u200f\u2028-\u202e` +
+    String.raw`\u2060-\u206f\u3164\ufeff\uffa0\ufff0-\ufffb\u{1d173}-\u{1d17a}\u{e0000}-\u{e007f}]`,
+  "gu",
+);
 /** Letters that look like Latin ones. */
 const LOOKALIKES = /[АВЕКМНОРСТУХаеорсухіІјЈѕЅһԁԛԜԝҮүӀӏΑΒΕΖΗΙΚΜΝΟΡΤΥΧοναινυρ]/gu;
-/** Text with names in it for people: those characters, and such letters beside Latin ones, are written as numbers. */
+/**
+ * Returns text that contains names, for people: invisible characters, and lookalikes beside Latin
+ * letters, are replaced by their numbers.
+ */
 function shown(text) {
   const number = (c) => `\\u{${c.codePointAt(0).toString(16)}}`;
   const mixed = (word) => (/[A-Za-z]/.test(word) ? word.replace(LOOKALIKES, number) : word);
   return text.replace(/\p{L}+/gu, mixed).replace(HIDDEN, number);
 }
 
-/** An element with properties, attributes (`aria-…`, `data-…`, `role`) and children; strings become text. */
+/**
+ * Makes an element with properties, attributes (`aria-…`, `data-…`, `role`) and children; strings
+ * become text.
+ */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(properties))
@@ -32,7 +44,10 @@ function make(tag, properties = {}, ...children) {
   return element;
 }
 
-/** Replaces what is in an element; what has the focus there keeps it, or its successor in the same place gets it. */
+/**
+ * Replaces the content of an element. The element with the focus keeps it, or its successor in the
+ * same position gets it.
+ */
 function keepingFocus(root, replace) {
   const all = () => [...root.querySelectorAll("button, select, input, [tabindex]")];
   const at = all().indexOf(document.activeElement);
@@ -40,9 +55,19 @@ function keepingFocus(root, replace) {
   if (at >= 0 && !root.contains(document.activeElement)) all()[at]?.focus();
 }
 
-/** Where an arrow key, Home or End leads from one of `count` in rows of `columns`; null for other keys. */
+/**
+ * Returns the position to which an arrow key, Home or End leads from `at`, among `count` items in
+ * rows of `columns`; null for other keys.
+ */
 function moved(at, count, columns, key) {
-  const to = { ArrowLeft: at - 1, ArrowRight: at + 1, ArrowUp: at - columns, ArrowDown: at + columns, Home: 0, End: count - 1 }[key];
+  const to = {
+    ArrowLeft: at - 1,
+    ArrowRight: at + 1,
+    ArrowUp: at - columns,
+    ArrowDown: at + columns,
+    Home: 0,
+    End: count - 1,
+  }[key];
   if (to === undefined || at < 0 || (columns === 1 && /Up|Down/.test(key))) return null;
   return to < 0 || to >= count ? at : to;
 }
@@ -56,7 +81,7 @@ const swatch = (colour) => {
 const percent = (share) =>
   share > 0 && share < 0.0005 ? "< 0.1 %" : `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)} %`;
 
-/** Draws small pictures of shapes, some in each frame, in the order in which they were asked for. */
+/** Draws small pictures of shapes, some in each frame, in the order of the requests. */
 class Thumbnails {
   constructor(app) {
     this.app = app;
@@ -74,7 +99,7 @@ class Thumbnails {
 
   frame() {
     const begin = performance.now();
-    // Sizes first: asking for one after a canvas has changed would lay the page out again.
+    // Reads all sizes first: reading one after a change of a canvas would compute the layout again.
     const sizes = new Map([...this.waiting.keys()].map((canvas) => [canvas, this.size(canvas)]));
     for (const [canvas, name] of this.waiting) {
       this.waiting.delete(canvas);
@@ -82,7 +107,7 @@ class Thumbnails {
       try {
         if (portrait && canvas.isConnected) this.draw(canvas, portrait, sizes.get(canvas));
       } catch (error) {
-        // The others are drawn all the same.
+        // The other pictures are drawn in spite of the error.
         console.error(name, error);
       }
       if (performance.now() - begin > BUDGET_MS) break;
@@ -97,7 +122,10 @@ class Thumbnails {
     this.atRest?.();
   }
 
-  /** Resolves when nothing waits to be drawn; soon where nothing is drawn at all, as in a page that nobody sees. */
+  /**
+   * Resolves when nothing waits to be drawn, or soon if nothing is drawn at all, as in a hidden
+   * page.
+   */
   idle() {
     if (!this.running) return new Promise((resolve) => setTimeout(resolve));
     return new Promise((resolve) => {
@@ -106,17 +134,24 @@ class Thumbnails {
     });
   }
 
-  /** Pixels of a picture. */
+  /** Returns the size of a picture in pixels. */
   size(canvas) {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    return [canvas.clientWidth, canvas.clientHeight].map((n) => Math.max(Math.round(n * ratio), 16));
+    return [canvas.clientWidth, canvas.clientHeight].map((n) =>
+      Math.max(Math.round(n * ratio), 16),
+    );
   }
 
   draw(canvas, portrait, [width, height]) {
     const { app, raster } = this;
-    const picture = raster.picture(new Mesh(portrait, app.up), (label) => app.shownColour(label), width, height);
+    const picture = raster.picture(
+      new Mesh(portrait, app.up),
+      (label) => app.shownColour(label),
+      width,
+      height,
+    );
     [canvas.width, canvas.height] = [width, height];
-    // In memory: a picture that comes from there is not to travel by way of an emulated graphics card.
+    // The picture comes from memory, so it should not pass through an emulated graphics card.
     canvas.getContext("2d", { willReadFrequently: true }).putImageData(picture, 0, 0);
     canvas.dataset.drawn = portrait.version;
   }
@@ -135,13 +170,14 @@ class Gallery {
       if (card) app.go({ shape: card.dataset.name, detail: null });
     });
     this.root.addEventListener("keydown", (event) => {
-      // Beside an open shape these go to other shapes.
+      // Beside an open shape, these keys go to other shapes.
       if (app.selected && /^Arrow(Left|Right)$/.test(event.key)) return;
       const cards = [...this.root.children];
       const columns = getComputedStyle(this.root).gridTemplateColumns.split(" ").length;
       const at = cards.indexOf(event.target);
-      // One column is walked up and down.
-      const key = columns === 1 ? event.key.replace("Up", "Left").replace("Down", "Right") : event.key;
+      // In one column, arrows up and down move by one card.
+      const key =
+        columns === 1 ? event.key.replace("Up", "Left").replace("Down", "Right") : event.key;
       const next = moved(at, cards.length, columns, key);
       if (next === null) return;
       event.preventDefault();
@@ -163,7 +199,8 @@ class Gallery {
       this.describe(card, shape);
       return card;
     });
-    if (cards.some((card, i) => this.root.children[i] !== card)) this.root.replaceChildren(...cards);
+    if (cards.some((card, i) => this.root.children[i] !== card))
+      this.root.replaceChildren(...cards);
   }
 
   card(shape) {
@@ -171,7 +208,12 @@ class Gallery {
       "button",
       { className: "card", "data-name": shape.name },
       make("canvas", { "aria-hidden": "true" }),
-      make("span", { className: "foot" }, make("span", { className: "name" }), make("span", { className: "mark" })),
+      make(
+        "span",
+        { className: "foot" },
+        make("span", { className: "name" }),
+        make("span", { className: "mark" }),
+      ),
     );
     this.cards.set(shape.name, card);
     this.sight.observe(card);
@@ -183,7 +225,9 @@ class Gallery {
     name.textContent = shown(shape.name);
     card.title = `${shape.name}: ${shape.n_polygons} faces, ${shape.parts.length} parts`;
     const doubt = certainty(shape) < 0.6;
-    const verdict = { approved: "✓ approved", doubtful: "? doubtful", corrected: "✎ corrected" }[shape.review?.state];
+    const verdict = { approved: "✓ approved", doubtful: "? doubtful", corrected: "✎ corrected" }[
+      shape.review?.state
+    ];
     mark.textContent = shape.stale ? "waiting" : verdict ?? (doubt ? "unsure" : "");
     mark.classList.toggle("doubt", doubt && !shape.stale);
     card.setAttribute("aria-current", String(this.app.selected === shape.name));
@@ -202,7 +246,7 @@ class Gallery {
     }
   }
 
-  /** Draws a shape's picture if it is in sight and not drawn as it is. */
+  /** Draws a shape's picture if it is visible and not up to date. */
   draw(name, again = false) {
     const card = this.cards.get(name);
     const portrait = this.app.portraits.get(name);
@@ -216,7 +260,7 @@ class Gallery {
     this.app.thumbnails.ask(card.firstChild, name);
   }
 
-  /** Draws all that are in sight again. */
+  /** Draws all visible pictures again. */
   redraw() {
     for (const name of this.cards.keys()) this.draw(name, true);
   }
@@ -228,7 +272,7 @@ class Gallery {
   }
 }
 
-/** Mean probability of a shape's labels. */
+/** Returns the mean probability of a shape's labels. */
 function certainty(shape) {
   return shape.parts.reduce((sum, p) => sum + p.area_share * p.confidence, 0);
 }

@@ -1,4 +1,4 @@
-// The labels of the collection: what each is called, and which of them alone is shown.
+// Lists the labels of the collection: names them, and selects the one that is shown alone.
 
 class Legend {
   constructor(app) {
@@ -7,7 +7,7 @@ class Legend {
   }
 
   show() {
-    // A name that is being typed stays.
+    // A name that is being typed must stay.
     if (this.root.querySelector("input")) return;
     const chips = this.app.labelsInUse().map((label) => this.chip(label));
     keepingFocus(this.root, () => this.root.replaceChildren(...chips));
@@ -17,13 +17,29 @@ class Legend {
     const { app } = this;
     const name = app.labelName(label.id);
     const chosen = app.only === label.id;
-    const choose = make("button", { className: "choose", "aria-pressed": String(chosen), title: "Show only shapes with this label" },
-      swatch(label.rgb), make("span", { className: "text" }, name),
-      make("span", { className: "n" }, String(label.n_shapes)));
+    const choose = make(
+      "button",
+      {
+        className: "choose",
+        "aria-pressed": String(chosen),
+        title: "Show only shapes with this label",
+      },
+      swatch(label.rgb),
+      make("span", { className: "text" }, name),
+      make("span", { className: "n" }, String(label.n_shapes)),
+    );
     choose.onclick = () => app.go({ label: chosen ? null : label.id }, { replace: true });
-    const chip = make("span", { className: chosen ? "chip chosen" : "chip", "data-label": label.id }, choose);
+    const chip = make(
+      "span",
+      { className: chosen ? "chip chosen" : "chip", "data-label": label.id },
+      choose,
+    );
     if (app.edit) {
-      const pencil = make("button", { className: "pencil", title: "Rename", "aria-label": `Rename ${name}` }, "✎");
+      const pencil = make(
+        "button",
+        { className: "pencil", title: "Rename", "aria-label": `Rename ${name}` },
+        "✎",
+      );
       pencil.onclick = () => this.rename(chip, label);
       chip.append(pencil);
     }
@@ -32,7 +48,12 @@ class Legend {
 
   rename(chip, label) {
     const { app } = this;
-    const input = make("input", { value: label.name ?? "", placeholder: `label ${label.id}`, maxLength: 128, "aria-label": "Name of the label" });
+    const input = make("input", {
+      value: label.name ?? "",
+      placeholder: `label ${label.id}`,
+      maxLength: 128,
+      "aria-label": "Name of the label",
+    });
     const choose = chip.querySelector(".choose");
     choose.replaceWith(input);
     input.focus();
@@ -54,7 +75,7 @@ class Legend {
     input.onkeydown = (event) => {
       event.stopPropagation();
       if (event.key !== "Enter" && event.key !== "Escape") return;
-      // Else the key would press the pencil, which has the focus next.
+      // Otherwise the key would press the pencil, which gets the focus next.
       event.preventDefault();
       end(event.key === "Enter", true);
     };

@@ -1,11 +1,16 @@
-// Portraits become triangles that can be drawn, picked and painted.
+// Converts portraits to triangles that can be drawn, picked and painted.
 
 /** Faces that meet at less than this angle share their normals. */
 const CREASE = Math.cos((38 * Math.PI) / 180);
 const UNLABELLED = [150, 150, 150];
 
 const AXES = {
-  "+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1],
+  "+x": [1, 0, 0],
+  "-x": [-1, 0, 0],
+  "+y": [0, 1, 0],
+  "-y": [0, -1, 0],
+  "+z": [0, 0, 1],
+  "-z": [0, 0, -1],
 };
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -13,7 +18,10 @@ const cross = (a, b) => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
 
-/** Right, up and front: with a known up the same for all; else a shape's middle side stands, its longest lies across. */
+/**
+ * Returns the directions right, up and front. With a known up axis they are the same for all
+ * shapes. Otherwise the shape's middle side stands, and its longest lies across.
+ */
 function uprightBasis(positions, up) {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity, -Infinity];
@@ -30,7 +38,7 @@ function uprightBasis(positions, up) {
   return { rows: [right, upright, cross(right, upright)], middle };
 }
 
-/** A mesh upright, about its middle, within a ball of radius 1. */
+/** A mesh that stands upright, centred, within a ball of radius 1. */
 class Mesh {
   constructor(portrait, up) {
     this.portrait = portrait;
@@ -56,7 +64,7 @@ class Mesh {
     this.weld = portrait.kind === "surface" ? welded(portrait.positions.data) : null;
   }
 
-  /** Label of each face, and its part where that is known. */
+  /** Sets the label of each face, and its part if known. */
   setLabels(portrait) {
     const { palette, labels } = portrait;
     this.labels = new Int32Array(labels.data.length);
@@ -65,7 +73,10 @@ class Mesh {
     this.polygons = portrait.polygons?.data ?? null;
   }
 
-  /** For each side of each face (opposite its corners) the faces across it: one, or none where there are several. */
+  /**
+   * Returns, for each side of each face (opposite its corners), the face across it; none if there
+   * are several.
+   */
   get across() {
     if (this._across) return this._across;
     const { faces, nFaces, weld } = this;
@@ -106,13 +117,13 @@ class Mesh {
     return (this._faceNormals = out);
   }
 
-  /** What the graphics card gets of the shape itself: for each corner its place and normal. */
+  /** Returns the arrays of the shape for the graphics card: position and normal of each corner. */
   corners() {
     const { positions, faces, nFaces, weld } = this;
     const normals = this.faceNormals;
     const n = positions.length / 3;
     const vertex = (corner) => (weld ? weld[faces[corner]] : faces[corner]);
-    // Corners around each vertex, one vertex after the other.
+    // The corners around each vertex, one vertex after the other.
     const begin = new Uint32Array(n + 1);
     for (let c = 0; c < 3 * nFaces; c++) begin[vertex(c) + 1]++;
     for (let v = 0; v < n; v++) begin[v + 1] += begin[v];
@@ -151,7 +162,10 @@ class Mesh {
     return { place, normal };
   }
 
-  /** For each corner how far each side is, where a side between two labels counts and others do not. */
+  /**
+   * Returns the distance of each corner from each side between two labels; other sides do not
+   * count.
+   */
   borders(labels = this.labels) {
     const { across, nFaces } = this;
     const out = new Uint8Array(12 * nFaces);
@@ -164,7 +178,10 @@ class Mesh {
     return out;
   }
 
-  /** The face seen at a place of the screen, with the point on it; `view` as in the picture. */
+  /**
+   * Returns the face at a position of the screen, and the point on it; `view` is that of the
+   * picture.
+   */
   pick(view, x, y) {
     const { positions: p, faces, nFaces } = this;
     const screen = view.project(p);
@@ -179,15 +196,18 @@ class Mesh {
       const u = (px * cy - py * cx) / area;
       const w = (bx * py - by * px) / area;
       if (u < 0 || w < 0 || u + w > 1) continue;
-      const depth = screen[a + 2] + u * (screen[b + 2] - screen[a + 2]) + w * (screen[c + 2] - screen[a + 2]);
+      const depth =
+        screen[a + 2] + u * (screen[b + 2] - screen[a + 2]) + w * (screen[c + 2] - screen[a + 2]);
       if (best && depth <= best.depth) continue;
-      const point = [0, 1, 2].map((i) => p[a + i] + u * (p[b + i] - p[a + i]) + w * (p[c + i] - p[a + i]));
+      const point = [0, 1, 2].map(
+        (i) => p[a + i] + u * (p[b + i] - p[a + i]) + w * (p[c + i] - p[a + i]),
+      );
       best = { face: f, depth, point };
     }
     return best;
   }
 
-  /** The faces that hang together with one, over sides that `over` lets pass. */
+  /** Returns the faces that are connected with one, across sides that `over` accepts. */
   flood(face, over) {
     const seen = new Uint8Array(this.nFaces);
     const found = [face];
@@ -205,12 +225,16 @@ class Mesh {
   centre(face) {
     const { positions: p, faces } = this;
     return [0, 1, 2].map(
-      (i) => (p[3 * faces[3 * face] + i] + p[3 * faces[3 * face + 1] + i] + p[3 * faces[3 * face + 2] + i]) / 3,
+      (i) =>
+        (p[3 * faces[3 * face] + i] +
+          p[3 * faces[3 * face + 1] + i] +
+          p[3 * faces[3 * face + 2] + i]) /
+        3,
     );
   }
 }
 
-/** For each vertex the first one at its place. */
+/** Returns, for each vertex, the first one at its position. */
 function welded(steps) {
   const first = new Map();
   const out = new Uint32Array(steps.length / 3);
@@ -224,7 +248,7 @@ function welded(steps) {
   return out;
 }
 
-/** Colour of each corner from a colour of each face. */
+/** Returns the colour of each corner from a colour of each face. */
 function faceColours(nFaces, colour) {
   const out = new Uint8Array(12 * nFaces);
   for (let f = 0; f < nFaces; f++) {
@@ -234,7 +258,7 @@ function faceColours(nFaces, colour) {
   return out;
 }
 
-/** Colour of each corner from a colour of each vertex. */
+/** Returns the colour of each corner from a colour of each vertex. */
 function vertexColours(mesh, colour) {
   const { faces } = mesh;
   const out = new Uint8Array(4 * faces.length);
@@ -254,7 +278,7 @@ const SEQUENTIAL = [
   [154, 146, 117], [187, 172, 108], [221, 201, 87], [254, 232, 56],
 ];
 
-/** A colour of a scale at 0 to 1. */
+/** Returns the colour of a scale at a value from 0 to 1. */
 function shade(scale, t) {
   const x = Math.min(Math.max(t, 0), 1) * (scale.length - 1);
   const i = Math.min(Math.floor(x), scale.length - 2);

@@ -1,6 +1,6 @@
-// What is known of the shape on the stage, and what is chosen for it.
+// Shows the data of the shape on the stage, and the controls for it.
 
-/** Lines of the history beside other things; its own view has all. */
+/** Maximum number of lines of the history beside other data; its own view has all. */
 const MAX_LINES = 60;
 
 class Panel {
@@ -9,7 +9,7 @@ class Panel {
     this.root = $("panel");
   }
 
-  /** Everything about a shape. */
+  /** Shows all data of a shape. */
   async show(name) {
     const { app } = this;
     const shape = app.shape(name);
@@ -56,7 +56,9 @@ class Panel {
       const fill = make("span", { className: "fill" });
       fill.style.width = `${(100 * part.area_share) / largest}%`;
       fill.style.background = css(colour);
-      const row = make("button", { className: "part", "aria-pressed": "false", "data-label": part.label },
+      const row = make(
+        "button",
+        { className: "part", "aria-pressed": "false", "data-label": part.label },
         swatch(colour),
         make("span", {}, app.labelName(part.label)),
         make("span", { className: "share" }, percent(part.area_share)),
@@ -80,7 +82,8 @@ class Panel {
   }
 
   neighbours(box, neighbours) {
-    if (neighbours.length === 0) box.replaceWith(make("div", { className: "facts" }, "no other shape"));
+    if (neighbours.length === 0)
+      box.replaceWith(make("div", { className: "facts" }, "no other shape"));
     for (const [name, distance] of neighbours) {
       const canvas = make("canvas", { "aria-hidden": "true" });
       const button = make("button", { title: `${name}, distance ${distance.toFixed(3)}` }, canvas,
@@ -91,12 +94,13 @@ class Panel {
     }
   }
 
-  /** What happened to the shape, and to the labels that all share; newest first. */
+  /** Lists the events of the shape and of the labels that all shapes share, newest first. */
   history(list, name, events) {
     const { app } = this;
     const lines = [];
     for (const e of [...events].reverse()) {
-      const about = e.shape === name ? shapeEvent(e) : e.shape === undefined ? labelEvent(e, app) : null;
+      const about =
+        e.shape === name ? shapeEvent(e) : e.shape === undefined ? labelEvent(e, app) : null;
       if (!about) continue;
       const moves = (e.moves ?? []).filter((m) => m.area_share >= 0.002).slice(0, 6);
       const items = moves.map((m) =>
@@ -110,7 +114,7 @@ class Panel {
     if (lines.length === 0) list.append(make("li", {}, "nothing yet"));
   }
 
-  /** What can be chosen in the mode of the stage. */
+  /** Shows the controls of the stage's mode. */
   showControls() {
     keepingFocus($("controls"), () => this.controls($("controls")));
   }
@@ -121,18 +125,42 @@ class Panel {
     const at = (value) => app.go({ detail: String(value + 1) }, { replace: true });
     this.mapBox?.replaceChildren();
     if (stage.mode === "eigen" && stage.functions)
-      box.replaceChildren(...slider("Eigenfunction", stage.eigen, stage.functions.eigenvalues.length, at, `${stage.eigen + 1}, λ = ${stage.functions.eigenvalues[stage.eigen].toPrecision(4)}`),
-      bar(DIVERGING), make("span", { className: "quiet" }, "− to +, lines of equal value"));
+      box.replaceChildren(
+        ...slider(
+          "Eigenfunction",
+          stage.eigen,
+          stage.functions.eigenvalues.length,
+          at,
+          `${stage.eigen + 1}, λ = ${stage.functions.eigenvalues[stage.eigen].toPrecision(4)}`,
+        ),
+        bar(DIVERGING),
+        make("span", { className: "quiet" }, "− to +, lines of equal value"),
+      );
     else if (stage.mode === "hks" && stage.functions)
-      box.replaceChildren(...slider("Time", stage.time, stage.functions.times.length, at, `t = ${stage.functions.times[stage.time].toPrecision(3)}`),
-      bar(SEQUENTIAL), make("span", { className: "quiet" }, "little to much heat left"));
+      box.replaceChildren(
+        ...slider(
+          "Time",
+          stage.time,
+          stage.functions.times.length,
+          at,
+          `t = ${stage.functions.times[stage.time].toPrecision(3)}`,
+        ),
+        bar(SEQUENTIAL),
+        make("span", { className: "quiet" }, "little to much heat left"),
+      );
     else if (stage.mode === "map") this.mapControls(box);
     else if (stage.mode === "correct") this.paintControls(box);
     else if (stage.mode === "ask") app.asker.controls(box);
     else
-      box.replaceChildren(make("span", { className: "quiet" },
-        "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over. " +
-        "With keys: Shift and arrows turn, + and − zoom, 0 starts over, ← and → go to other shapes"));
+      box.replaceChildren(
+        make(
+          "span",
+          { className: "quiet" },
+          "Drag to turn · scroll to zoom · Shift and drag to move · double-click to start over. " +
+            "With keys: Shift and arrows turn, + and − zoom, 0 starts over, " +
+              "← and → go to other shapes",
+        ),
+      );
   }
 
   mapControls(box) {
@@ -141,11 +169,15 @@ class Panel {
       ...this.app.mapSources(selected).map((name) => make("option", { value: name }, name)));
     from.value = stage.from ?? "";
     from.onchange = () => this.app.go({ detail: from.value });
-    const what = make("select", { "aria-label": "What is carried" },
-      make("option", { value: "labels" }, "labels"), make("option", { value: "place" }, "colours of places"));
-    what.value = stage.carried;
+    const what = make(
+      "select",
+      { "aria-label": "What the map transfers" },
+      make("option", { value: "labels" }, "labels"),
+      make("option", { value: "place" }, "colours of places"),
+    );
+    what.value = stage.transferred;
     what.onchange = () => {
-      stage.carried = what.value;
+      stage.transferred = what.value;
       stage.refresh();
     };
     box.replaceChildren(make("label", {}, "From", from), make("label", {}, "Carry", what),
@@ -174,11 +206,17 @@ class Panel {
          ["entries near zero", percent(q.near_zero)],
          ["descriptor residual", q.descriptor_residual.toPrecision(3)],
          ["area that something matches", percent(q.matched)],
-         ["carried labels expected to be right", percent(q.confidence)]]
+         ["transferred labels expected to be right", percent(q.confidence)]]
       : [];
     this.mapBox.replaceChildren(
-      make("h3", {}, "Functional map"), canvas,
-      make("div", { className: "quality" }, ...facts.flatMap(([k, v]) => [make("span", {}, k), make("b", {}, v)])));
+      make("h3", {}, "Functional map"),
+      canvas,
+      make(
+        "div",
+        { className: "quality" },
+        ...facts.flatMap(([k, v]) => [make("span", {}, k), make("b", {}, v)]),
+      ),
+    );
   }
 
   paintControls(box) {
@@ -196,20 +234,36 @@ class Panel {
     const entry = (label, text) => {
       const at = all.indexOf(label);
       const key = at < 9 ? { "data-key": at + 1 } : {};
-      const button = make("button", { "aria-pressed": String(brush.label === label), "data-label": label, ...key },
-        swatch(this.app.colour(label)), text);
+      const button = make(
+        "button",
+        { "aria-pressed": String(brush.label === label), "data-label": label, ...key },
+        swatch(this.app.colour(label)),
+        text,
+      );
       button.onclick = () => choose(label);
       return button;
     };
-    const tool = make("select", { "aria-label": "Tool" },
-      make("option", { value: "brush" }, "Brush (b)"), make("option", { value: "part" }, "Fill a part (f)"),
-      make("option", { value: "eraser" }, "Eraser (e)"));
+    const tool = make(
+      "select",
+      { "aria-label": "Tool" },
+      make("option", { value: "brush" }, "Brush (b)"),
+      make("option", { value: "part" }, "Fill a part (f)"),
+      make("option", { value: "eraser" }, "Eraser (e)"),
+    );
     tool.value = brush.tool;
     tool.onchange = () => {
       brush.tool = tool.value;
       size.disabled = brush.tool === "part";
     };
-    const size = make("input", { type: "range", min: 0.02, max: 0.5, step: 0.01, value: brush.size, disabled: brush.tool === "part", "aria-label": "Size of the brush" });
+    const size = make("input", {
+      type: "range",
+      min: 0.02,
+      max: 0.5,
+      step: 0.01,
+      value: brush.size,
+      disabled: brush.tool === "part",
+      "aria-label": "Size of the brush",
+    });
     size.oninput = () => (brush.size = Number(size.value));
     size.style.width = "90px";
     this.apply = make("button", { className: "primary", id: "apply" }, "Apply");
@@ -217,14 +271,22 @@ class Panel {
     this.discard = make("button", { id: "discard" }, "Discard");
     this.discard.onclick = () => stage.discard();
     this.amount = make("span", { className: "quiet" });
-    box.replaceChildren(tool, size,
-      make("div", { className: "palette" }, ...ids.map((id) => entry(id, this.app.labelName(id))), entry(fresh, "new label")),
-      make("span", { className: "ends" }, this.amount, this.discard, this.apply));
+    box.replaceChildren(
+      tool,
+      size,
+      make(
+        "div",
+        { className: "palette" },
+        ...ids.map((id) => entry(id, this.app.labelName(id))),
+        entry(fresh, "new label"),
+      ),
+      make("span", { className: "ends" }, this.amount, this.discard, this.apply),
+    );
     $("scene").classList.add("painting");
     this.paintedChanged();
   }
 
-  /** Takes a key for painting; true if it meant something. */
+  /** Handles a key for painting; returns whether it has a meaning here. */
   paintKey(key) {
     const { stage } = this.app;
     const { brush } = stage;
@@ -234,7 +296,8 @@ class Panel {
     if (tool) brush.tool = tool;
     else if (label !== undefined) brush.label = label;
     else if (size) brush.size = Math.min(Math.max(brush.size * size, 0.02), 0.5);
-    else if (key === "Enter" && stage.painted.size && document.activeElement === stage.canvas) this.app.correct();
+    else if (key === "Enter" && stage.painted.size && document.activeElement === stage.canvas)
+      this.app.correct();
     else return false;
     this.showControls();
     return true;
@@ -244,11 +307,13 @@ class Panel {
     const n = this.app.stage.painted.size;
     if (!this.apply) return;
     this.apply.disabled = this.discard.disabled = n === 0;
-    this.amount.textContent = n ? `${counted(n, "face")} painted` : "paint on the shape, or press its parts in the list; drag beside it to turn";
+    this.amount.textContent = n
+      ? `${counted(n, "face")} painted`
+      : "paint on the shape, or press its parts in the list; drag beside it to turn";
   }
 }
 
-/** A number with its noun. */
+/** Returns a number with its noun. */
 function counted(n, noun) {
   return `${n.toLocaleString("en")} ${noun}${n === 1 ? "" : "s"}`;
 }
@@ -260,7 +325,7 @@ function slider(text, value, count, changed, shown) {
   input.setAttribute("aria-label", text);
   input.oninput = () => changed(Number(input.value));
   const label = make("label", {}, text, input);
-  // The slider stays the one that is being moved.
+  // The slider that is being moved must stay.
   const now = $("controls").querySelector("input[type=range]");
   if (now && now.getAttribute("aria-label") === text && document.activeElement === now) {
     now.oninput = input.oninput;
@@ -276,9 +341,9 @@ function bar(scale) {
 }
 
 const CAUSES = {
-  reclustering: "the collection was clustered anew",
+  reclustering: "the collection was clustered again",
   correction: "corrected by a person",
-  carrying: "a correction was carried here",
+  carrying: "a correction was propagated here",
   merge: "labels were merged",
   split: "a label was split",
   undo: "a change was undone",
@@ -288,9 +353,15 @@ function shapeEvent(e) {
   switch (e.kind) {
     case "shape_added": return { text: `added, labels version ${e.version}` };
     case "labels_changed":
-      return { text: `version ${e.version}: ${CAUSES[e.cause] ?? e.cause}`, person: e.cause === "correction" };
+      return {
+        text: `version ${e.version}: ${CAUSES[e.cause] ?? e.cause}`,
+        person: e.cause === "correction",
+      };
     case "corrected":
-      return { text: `${e.n_faces} faces (${percent(e.area_share)}) labelled by hand`, person: true };
+      return {
+        text: `${e.n_faces} faces (${percent(e.area_share)}) labelled by hand`,
+        person: true,
+      };
     default: return null;
   }
 }
@@ -298,16 +369,22 @@ function shapeEvent(e) {
 function labelEvent(e, app) {
   const name = (id) => app.labelName(id);
   switch (e.kind) {
-    case "label_named": return { text: `label ${e.label} named “${e.name}”`, person: true };
-    case "label_merged": return { text: `${name(e.from)} merged into ${name(e.into)}`, person: true };
-    case "label_split": return { text: `${name(e.from)} split`, person: true };
-    case "undone": return { text: `${e.change} undone`, person: true };
-    case "up_changed": return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
-    default: return null;
+    case "label_named":
+      return { text: `label ${e.label} named “${e.name}”`, person: true };
+    case "label_merged":
+      return { text: `${name(e.from)} merged into ${name(e.into)}`, person: true };
+    case "label_split":
+      return { text: `${name(e.from)} split`, person: true };
+    case "undone":
+      return { text: `${e.change} undone`, person: true };
+    case "up_changed":
+      return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
+    default:
+      return null;
   }
 }
 
-/** A person's verdict, with who gave it and when. */
+/** Returns the text of a person's verdict, with name and time. */
 function verdictText(review) {
   if (!review || review.state === "unseen") return "nobody has given a verdict";
   const by = review.by ? ` by ${review.by}` : "";
@@ -318,13 +395,21 @@ function verdictText(review) {
 function meshText(shape) {
   const r = shape.report ?? {};
   const found = [
-    [r.n_components > 1 && r.n_components, "components"], [r.n_welded_vertices, "vertices welded"],
-    [r.n_degenerate_triangles, "degenerate triangles dropped"], [r.n_duplicate_triangles, "duplicate triangles dropped"],
-    [r.n_nonmanifold_edges, "non-manifold edges"], [r.n_boundary_edges, "boundary edges"],
-     [r.n_inner_walls, "inner walls left to those around them"], [r.n_bridges, "virtual edges"],
-    [r.n_concave_polygons, "concave polygons"], [r.n_nonplanar_polygons, "polygons not planar"],
+    [r.n_components > 1 && r.n_components, "components"],
+    [r.n_welded_vertices, "vertices welded"],
+    [r.n_degenerate_triangles, "degenerate triangles dropped"],
+    [r.n_duplicate_triangles, "duplicate triangles dropped"],
+    [r.n_nonmanifold_edges, "non-manifold edges"],
+    [r.n_boundary_edges, "boundary edges"],
+    [r.n_inner_walls, "inner walls left to those around them"],
+    [r.n_bridges, "virtual edges"],
+    [r.n_concave_polygons, "concave polygons"],
+    [r.n_nonplanar_polygons, "polygons not planar"],
     [r.n_nonsimple_polygons, "polygons that cross themselves or have no area"],
-    [r.n_tolerated_statements, "statements that programs differ about read"], [r.n_unread_statements, "other statements not read"],
-  ].filter(([n]) => n > 0).map(([n, what]) => `${n} ${what}`);
+    [r.n_tolerated_statements, "statements that programs differ about read"],
+    [r.n_unread_statements, "other statements not read"],
+  ]
+    .filter(([n]) => n > 0)
+    .map(([n, what]) => `${n} ${what}`);
   return `${found.join(", ") || "clean"}; worked on with ${r.n_proxy_faces} faces`;
 }

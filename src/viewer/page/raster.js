@@ -1,19 +1,28 @@
-// Triangles become a small picture on the processor: an emulated graphics card takes longer to hand one over than it takes
-// to draw it here, and a real one has nothing to do that is worth its start.
+// Draws triangles as small pictures on the processor. An emulated graphics card takes longer to
+// return a picture than this takes to draw it, and for a real one the pictures are too few to be
+// worth its start.
 
-/** Samples of a pixel, in each direction. */
+/** Number of samples in a pixel, in each direction. */
 const SAMPLES = 2;
-/** Corners whose face is less than this off the mean around their vertex are lit by that mean. */
+/**
+ * A corner is lit by the mean normal around its vertex if its face is within this angle of the
+ * mean.
+ */
 const SMOOTH = Math.cos((36 * Math.PI) / 180);
-/** Half the width of lines between labels, in pixels, and over how much they fade. */
+/** Half the width of lines between labels, in pixels; then the distance over which they fade. */
 const LINE = [0.35, 1.35];
-/** How dark such lines are. */
+/** Darkness of such lines. */
 const LINE_SHADE = 0.32;
-/** Light from none to full in so many steps, as a screen wants it. */
+/** Number of steps of light from none to full, enough for a screen. */
 const STEPS = 1023;
 const GAMMA = 2.2;
-const ON_SCREEN = Uint8Array.from({ length: STEPS + 1 }, (_, i) => Math.round(255 * (i / STEPS) ** (1 / GAMMA)));
-/** The directions of `FRAGMENT` in draw.js: of both lights, and of the first with the eye. */
+const ON_SCREEN = Uint8Array.from({ length: STEPS + 1 }, (_, i) =>
+  Math.round(255 * (i / STEPS) ** (1 / GAMMA)),
+);
+/**
+ * Directions from `FRAGMENT` in draw.js: of both lights, and halfway between the first light and
+ * the eye.
+ */
 const KEY = direction(0.45, 0.75, 0.65);
 const FILL = direction(-0.8, 0.1, 0.5);
 
@@ -30,14 +39,15 @@ class Raster {
     this.light = new Float32Array(0);
   }
 
-  /** A mesh as it is seen first, with its faces in colours of their labels. */
+  /** Returns the first view of a mesh, with its faces in the colours of their labels. */
   picture(mesh, colour, width, height) {
     const view = new View();
     const [columns, rows] = [width * SAMPLES, height * SAMPLES];
     view.box = [0, 0, columns, rows];
     view.fit([mesh]);
     const n = columns * rows;
-    if (this.depth.length !== n) [this.depth, this.colours] = [new Float32Array(n), new Uint32Array(n)];
+    if (this.depth.length !== n)
+      [this.depth, this.colours] = [new Float32Array(n), new Uint32Array(n)];
     this.depth.fill(-Infinity);
     this.colours.fill(0);
     this.fill(mesh, view, colour, columns, rows);
@@ -69,8 +79,8 @@ class Raster {
       if (left > right || top > bottom) continue;
       let paint = paints.get(labels[f]);
       if (!paint) paints.set(labels[f], (paint = colour(labels[f]).map((x) => (x / 255) ** GAMMA)));
-      // Red, green and blue of the first corner, and how much more the others have. In a loop, or taken apart as an array,
-      // this would cost as much as all the rest.
+      // Red, green and blue of the first corner, and the differences of the others. A loop, or
+      // arrays, would cost as much as everything else here.
       const l = 12 * f;
       const pr = paint[0], pg = paint[1], pk = paint[2];
       const r = pr * light[l] + light[l + 3];
@@ -79,18 +89,22 @@ class Raster {
       const rb = pr * light[l + 4] + light[l + 7] - r, rc = pr * light[l + 8] + light[l + 11] - r;
       const gb = pg * light[l + 5] + light[l + 7] - g, gc = pg * light[l + 9] + light[l + 11] - g;
       const kb = pk * light[l + 6] + light[l + 7] - k, kc = pk * light[l + 10] + light[l + 11] - k;
-      // Samples between a corner and the side opposite, where that side is between two labels.
+      // Distance of a sample from each side, where the side is between two labels.
       const lines = between[f];
       const toA = lines & 1 ? Math.abs(area) / Math.hypot(cx - bx, cy - by) : Infinity;
       const toB = lines & 2 ? Math.abs(area) / Math.hypot(cx, cy) : Infinity;
       const toC = lines & 4 ? Math.abs(area) / Math.hypot(bx, by) : Infinity;
-      // Shares of the second and the third corner, and how they grow from sample to sample.
+      // Shares of the second and the third corner, and their increments from sample to sample.
       const right1 = cy / area, down1 = -cx / area, right2 = -by / area, down2 = bx / area;
       for (let y = top; y <= bottom; y++) {
         const px = left + 0.5 - ax, py = y + 0.5 - ay;
         let u = px * right1 + py * down1;
         let v = px * right2 + py * down2;
-        for (let at = y * columns + left, end = y * columns + right; at <= end; at++, u += right1, v += right2) {
+        for (
+          let at = y * columns + left, end = y * columns + right;
+          at <= end;
+          at++, u += right1, v += right2
+        ) {
           if (u < 0 || v < 0 || u + v > 1) continue;
           const near = az + u * bz + v * cz;
           if (near <= depth[at]) continue;
@@ -110,7 +124,10 @@ class Raster {
     }
   }
 
-  /** Pixels as means of their samples; what covers some of them is transparent in part. */
+  /**
+   * Returns pixels as means of their samples; a pixel that is covered in part is transparent in
+   * part.
+   */
   averaged(width, height) {
     const { colours } = this;
     const columns = width * SAMPLES;
@@ -138,10 +155,12 @@ class Raster {
   }
 }
 
-/** For each face which of the sides opposite its corners (1, 2, 4) are between two labels. */
+/**
+ * Returns, for each face, which of the sides opposite its corners (1, 2, 4) are between two labels.
+ */
 function sidesBetween({ positions, faces, nFaces, labels }) {
   const n = positions.length / 3;
-  // Such a side is between two vertices that faces of several labels meet at; those are few.
+  // Such a side is between two vertices with faces of several labels, and these vertices are few.
   const of = new Int32Array(n).fill(-2);
   const mixed = new Uint8Array(n);
   for (let c = 0; c < 3 * nFaces; c++) {
@@ -167,7 +186,10 @@ function sidesBetween({ positions, faces, nFaces, labels }) {
   return sides;
 }
 
-/** For each corner what light does to red, green and blue there, and what it adds to all: as `FRAGMENT` in draw.js. */
+/**
+ * Computes, for each corner, the factors of light for red, green and blue, and the light added to
+ * all, as `FRAGMENT` in draw.js does.
+ */
 function shine(mesh, view, out) {
   const { positions: p, faces, nFaces } = mesh;
   const own = mesh.faceNormals;
@@ -180,7 +202,7 @@ function shine(mesh, view, out) {
   const t = view.turn;
   const half = direction(KEY[0], KEY[1], KEY[2] + 1);
   const lit = (to, x, y, z, v) => {
-    // Turned as the shape is, and towards the eye.
+    // Rotated with the shape, and facing the eye.
     const size = Math.sqrt(x * x + y * y + z * z) || 1;
     let nx = (t[0] * x + t[1] * y + t[2] * z) / size;
     let ny = (t[3] * x + t[4] * y + t[5] * z) / size;
@@ -205,7 +227,7 @@ function shine(mesh, view, out) {
     out[to + 2] = all + 1.1 * sky + 0.95 * key;
     out[to + 3] = 0.06 * Math.max(nx * half[0] + ny * half[1] + nz * half[2], 0) ** 28;
   };
-  // A vertex around which all is smooth is lit once.
+  // A vertex with a smooth neighbourhood is lit once.
   const known = new Int32Array(p.length / 3).fill(-1);
   for (let c = 0; c < 3 * nFaces; c++) {
     const f = c - (c % 3);
@@ -213,7 +235,8 @@ function shine(mesh, view, out) {
     const x = own[f], y = own[f + 1], z = own[f + 2];
     const mx = mean[v], my = mean[v + 1], mz = mean[v + 2];
     const along = x * mx + y * my + z * mz;
-    const smooth = along > SMOOTH * Math.sqrt((x * x + y * y + z * z) * (mx * mx + my * my + mz * mz));
+    const smooth =
+      along > SMOOTH * Math.sqrt((x * x + y * y + z * z) * (mx * mx + my * my + mz * mz));
     if (!smooth) lit(4 * c, x, y, z, v);
     else if (known[faces[c]] < 0) {
       lit(4 * c, mx, my, mz, v);

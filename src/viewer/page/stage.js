@@ -1,11 +1,12 @@
-// One shape, large: turned, coloured by what was chosen, corrected.
+// Shows one shape, large: rotates it, colours it, and lets a person correct it.
 
-/** Triangles up to which the mesh that was sent is shown instead of the proxy. */
+/** Maximum number of triangles of a sent mesh that is shown instead of the proxy. */
 const MAX_SURFACE = 120_000;
 /**
- * Share of carried labels that are expected to be right below which a map comes with a warning: a face in four is wrong.
- * The poorest fifth of the maps between shapes of one class is like that, and carries 0.73 of the area rightly; the label
- * model alone has 0.89 (docs/maps.md).
+ * Share of transferred labels that are expected to be right, below which a map is shown with a
+ * warning: one face in four is wrong. This holds for the poorest fifth of the maps between shapes
+ * of one class, which transfer 0.73 of the area correctly; the label model alone has 0.89
+ * (docs/maps.md).
  */
 const POOR_MAP = 0.75;
 /** Share of its box that a shape fills. */
@@ -19,7 +20,7 @@ class Stage {
     this.mode = "labels";
     this.eigen = 0;
     this.time = null;
-    this.carried = "labels";
+    this.transferred = "labels";
     this.brush = { label: null, size: 0.1, tool: "brush" };
     this.painted = new Strokes();
     this.listen();
@@ -29,7 +30,7 @@ class Stage {
     return (this._renderer ??= new Renderer(this.canvas));
   }
 
-  /** Shows a shape from the start; resolves when all that the mode needs is drawn. */
+  /** Shows a shape in its first view. Resolves when everything that the mode needs is drawn. */
   async show(name) {
     this.name = name;
     this.painted.clear();
@@ -38,7 +39,7 @@ class Stage {
     await this.refresh();
   }
 
-  /** Takes over what an address says of the shape. */
+  /** Selects the view and the detail of an address. */
   choose({ view, detail }) {
     if (this.mode !== view) {
       this.highlight = null;
@@ -66,13 +67,13 @@ class Stage {
     $("notice").hidden = !text;
   }
 
-  /** Warns of what is shown. */
+  /** Shows a warning about the view. */
   advise(text) {
     $("advice").textContent = text;
     $("advice").hidden = !text;
   }
 
-  /** Fetches and shows what belongs to shape and mode; a later call makes an earlier one void. */
+  /** Fetches and shows the data of shape and mode. A later call cancels an earlier one. */
   async refresh() {
     const ticket = (this.ticket = (this.ticket ?? 0) + 1);
     const { app, name, mode } = this;
@@ -104,20 +105,32 @@ class Stage {
     const { app } = this;
     const proxy = new Mesh(portrait, app.up);
     const before = app.changes.before(name);
-    if (before && mode === "labels") return [{ mesh: new Mesh(before, app.up), caption: name, note: "before the last change" }];
+    if (before && mode === "labels")
+      return [{ mesh: new Mesh(before, app.up), caption: name, note: "before the last change" }];
     if (mode === "labels" || mode === "history" || mode === "correct" || mode === "ask") {
       const info = app.shape(name);
       const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
       if (!fine && mode === "correct")
-        throw new Error(`With ${info.n_polygons} faces this shape is corrected with “coseg correct”.`);
+        throw new Error(
+          `With ${info.n_polygons} faces this shape is corrected with “coseg correct”.`,
+        );
       if (!fine && mode === "ask")
-        throw new Error(`With ${info.n_polygons} faces this shape is asked about with “coseg ask --png FILE”.`);
+        throw new Error(
+          `With ${info.n_polygons} faces this shape is asked about with “coseg ask --png FILE”.`,
+        );
       if (!fine) return [{ mesh: proxy, caption: name, note: this.resolution(portrait, info) }];
-      // The proxy at once, the mesh that was sent as soon as it is there.
-      if (!this.scenes?.some((s) => s.mesh.portrait.name === name)) this.present([{ mesh: proxy, caption: name }]);
+      // The proxy appears at once, the sent mesh as soon as it is loaded.
+      if (!this.scenes?.some((s) => s.mesh.portrait.name === name))
+        this.present([{ mesh: proxy, caption: name }]);
       const surface = await app.surface(name);
       if (ticket !== this.ticket) return [];
-      return [{ mesh: new Mesh(surface, app.up), caption: name, note: `${info.n_polygons} faces, as sent` }];
+      return [
+        {
+          mesh: new Mesh(surface, app.up),
+          caption: name,
+          note: `${info.n_polygons} faces, as sent`,
+        },
+      ];
     }
     if (mode === "map") return this.buildMap(name, proxy);
     const functions = await app.functions(name);
@@ -132,7 +145,10 @@ class Stage {
       scene.contours = 5;
       scene.note = `eigenfunction ${this.eigen + 1}`;
     } else {
-      this.time = Math.min(this.time ?? Math.floor(functions.times.length / 3), functions.times.length - 1);
+      this.time = Math.min(
+        this.time ?? Math.floor(functions.times.length / 3),
+        functions.times.length - 1,
+      );
       const values = column(functions.hks, this.time);
       const sorted = Float32Array.from(values).sort();
       const [low, high] = [sorted[0], sorted[Math.floor(0.98 * (sorted.length - 1))]];
@@ -156,27 +172,42 @@ class Stage {
     if (!sources.includes(this.from)) this.from = sources[0];
     const map = (this.map = await app.map(this.from, name));
     const right = map.quality?.confidence ?? 1;
-    if (missing) this.advise(`There is no map from “${missing}” here; this one is from “${this.from}”.`);
+    if (missing)
+      this.advise(`There is no map from “${missing}” here; this one is from “${this.from}”.`);
     if (right < POOR_MAP)
       this.advise(
-        `This map is poor: ${percent(right)} of the labels that it carries are expected to be right. ` +
-          "Do not build on it; another shape under “From” may fit better.",
+        `This map is poor: ${percent(right)} of the labels that it transfers are expected ` +
+          "to be right. Do not build on it; another shape under “From” may fit better.",
       );
     const source = new Mesh(app.portraits.get(this.from), app.up);
-    const colour = this.carried === "labels" ? labelColours(source, app) : placeColours(source);
+    const colour = this.transferred === "labels" ? labelColours(source, app) : placeColours(source);
     const back = map.p2p_21.data;
     return [
-      { mesh: source, caption: this.from, note: "from this shape", colours: vertexColours(source, colour), plain: true },
-      { mesh: proxy, caption: name, note: `carried to this one, ${percent(right)} right as expected`, colours: vertexColours(proxy, (v) => colour(back[v])), plain: true },
+      {
+        mesh: source,
+        caption: this.from,
+        note: "from this shape",
+        colours: vertexColours(source, colour),
+        plain: true,
+      },
+      {
+        mesh: proxy,
+        caption: name,
+        note: `mapped to this one, ${percent(right)} right as expected`,
+        colours: vertexColours(proxy, (v) => colour(back[v])),
+        plain: true,
+      },
     ];
   }
 
   resolution(portrait, info) {
     const shown = portrait.labels.data.length;
-    return shown === info.n_polygons ? `${shown} faces` : `working resolution: ${shown} of ${info.n_polygons} faces`;
+    return shown === info.n_polygons
+      ? `${shown} faces`
+      : `working resolution: ${shown} of ${info.n_polygons} faces`;
   }
 
-  /** Takes over what is to be drawn. */
+  /** Sets the meshes that are drawn. */
   present(scenes) {
     if (scenes.length === 0) return;
     this.drop();
@@ -184,7 +215,11 @@ class Stage {
     for (const scene of scenes) {
       scene.uploaded = this.renderer.upload(scene.mesh);
       if (scene.values)
-        this.renderer.update(scene.uploaded, "value", Float32Array.from(scene.mesh.faces, (v) => scene.values[v]));
+        this.renderer.update(
+          scene.uploaded,
+          "value",
+          Float32Array.from(scene.mesh.faces, (v) => scene.values[v]),
+        );
     }
     this.colour();
     $("captions").replaceChildren(
@@ -196,7 +231,7 @@ class Stage {
     this.draw();
   }
 
-  /** Starts over: seen from where every shape is seen first. */
+  /** Returns to the first view of a shape. */
   fit() {
     this.fitted = true;
     const turned = new View();
@@ -204,21 +239,22 @@ class Stage {
     this.fill();
   }
 
-  /** Fills the room there is, as seen from where it is seen now. */
+  /** Scales the shape to the available room in the present direction. */
   fill() {
     this.moved = false;
     this.view.box = [0, 0, this.canvas.width / this.scenes.length, this.canvas.height];
     this.view.fit(this.scenes.map((scene) => scene.mesh));
-    // Below the captions.
+    // The room below the captions.
     const captions = $("captions");
-    const taken = (captions.offsetTop + captions.offsetHeight) / Math.max(this.canvas.clientHeight, 1);
+    const taken =
+      (captions.offsetTop + captions.offsetHeight) / Math.max(this.canvas.clientHeight, 1);
     const room = Math.max(Math.min(ROOM, 1 - taken), 0.4);
     this.view.zoom *= room;
     const [x, y] = this.view.pan;
     this.view.pan = [x * room, y * room - 2 * Math.max(taken - (1 - room) / 2, 0)];
   }
 
-  /** Label of each face as painted so far. */
+  /** Returns the label of each face, including painted labels. */
   paintedLabels(mesh) {
     if (this.painted.size === 0 || !mesh.polygons) return mesh.labels;
     return mesh.labels.map((label, f) => this.painted.labels.get(mesh.polygons[f]) ?? label);
@@ -229,7 +265,8 @@ class Stage {
     for (const { mesh, uploaded, colours, plain, values } of this.scenes) {
       if (colours) {
         renderer.update(uploaded, "colour", colours);
-        if (plain || values) renderer.update(uploaded, "border", new Uint8Array(4 * uploaded.nCorners).fill(255));
+        if (plain || values)
+          renderer.update(uploaded, "border", new Uint8Array(4 * uploaded.nCorners).fill(255));
         continue;
       }
       const labels = this.paintedLabels(mesh);
@@ -244,19 +281,20 @@ class Stage {
     }
   }
 
-  /** Which faces of a mesh a person is asked about. */
+  /** Returns which faces of a mesh the question is about. */
   asked(mesh) {
     const { asker } = this.app;
     if (this.mode !== "ask" || !mesh.polygons || !asker.asks(this.name)) return null;
     return (f) => asker.question.faces.has(mesh.polygons[f]);
   }
 
-  /** Which faces of a mesh a highlighted part or label covers. */
+  /** Returns which faces of a mesh a highlighted part or label covers. */
   highlighted(mesh, highlight) {
     if (!highlight) return null;
     if (mesh.parts && highlight.part !== undefined) return (f) => mesh.parts[f] === highlight.part;
     if (highlight.part === undefined) return (f) => mesh.labels[f] === highlight.label;
-    // The mesh that was sent has no parts of its own: pieces of the label, the one of about that share of the area.
+    // The sent mesh has no parts of its own. Among the pieces of the label, this takes the one with
+    // about the same share of the area.
     const pieces = mesh.pieces ?? (mesh.pieces = piecesOf(mesh));
     let best = null;
     for (const piece of pieces)
@@ -279,7 +317,8 @@ class Stage {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(Math.round(this.canvas.clientWidth * ratio), 1);
     const height = Math.max(Math.round(this.canvas.clientHeight * ratio), 1);
-    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
+    if (this.canvas.width !== width || this.canvas.height !== height)
+      [this.canvas.width, this.canvas.height] = [width, height];
   }
 
   draw() {
@@ -292,12 +331,15 @@ class Stage {
       const width = this.canvas.width / this.scenes.length;
       this.scenes.forEach(({ uploaded, contours, values, plain }, i) => {
         this.view.box = [Math.round(i * width), 0, Math.round(width), this.canvas.height];
-        this.renderer.draw(uploaded, this.view, { contours: contours ?? 0, lines: values || plain ? 0 : 1.4 });
+        this.renderer.draw(uploaded, this.view, {
+          contours: contours ?? 0,
+          lines: values || plain ? 0 : 1.4,
+        });
       });
     });
   }
 
-  /** What is at a place of the page. */
+  /** Returns the face and the mesh at a position of the page. */
   pick(event) {
     if (!this.scenes?.length) return null;
     const box = this.canvas.getBoundingClientRect();
@@ -367,7 +409,8 @@ class Stage {
         this.fit();
         return this.draw();
       }
-      const arrow = event.shiftKey && event.key.startsWith("Arrow") ? event.key.slice(5) : event.key;
+      const arrow =
+        event.shiftKey && event.key.startsWith("Arrow") ? event.key.slice(5) : event.key;
       const step = { a: [-0.15, 0], d: [0.15, 0], w: [0, 0.1], s: [0, -0.1],
         Left: [-0.15, 0], Right: [0.15, 0], Up: [0, 0.1], Down: [0, -0.1] }[arrow];
       if (!step) return;
@@ -391,20 +434,24 @@ class Stage {
     this.draw();
   }
 
-  /** Shows how large the brush is where the pointer is. */
+  /** Shows the size of the brush at the pointer. */
   moveCursor(event) {
     const cursor = $("cursor");
     const shown = this.mode === "correct" && this.brush.tool !== "part" && this.pick(event);
     cursor.hidden = !shown;
     if (!shown) return;
     const box = this.canvas.getBoundingClientRect();
-    // As View.scale has it.
+    // The same factor as in View.scale.
     const pixels = 0.9 * this.reach() * this.view.zoom * Math.min(box.width, box.height);
-    Object.assign(cursor.style, { left: `${event.clientX - box.left}px`, top: `${event.clientY - box.top}px`,
-      width: `${pixels}px`, height: `${pixels}px` });
+    Object.assign(cursor.style, {
+      left: `${event.clientX - box.left}px`,
+      top: `${event.clientY - box.top}px`,
+      width: `${pixels}px`,
+      height: `${pixels}px`,
+    });
   }
 
-  /** Radius of the brush in units of the shape. */
+  /** Returns the radius of the brush in units of the shape. */
   reach() {
     return this.brush.size / Math.max(this.view.zoom, 0.5);
   }
@@ -428,7 +475,10 @@ class Stage {
     }
   }
 
-  /** Paints where the pointer is; false if it is not on the shape, or nothing is chosen to paint with. */
+  /**
+   * Paints at the pointer. Returns false if the pointer is not on the shape, or no label is
+   * selected.
+   */
   paint(event) {
     const { brush } = this;
     const found = brush.label !== null && this.pick(event);
@@ -444,20 +494,22 @@ class Stage {
       const near = (f) => Math.hypot(...mesh.centre(f).map((x, i) => x - found.point[i])) < reach;
       faces = mesh.flood(found.face, near);
     }
-    for (const f of faces) this.painted.paint(mesh.polygons[f], brush.tool === "eraser" ? null : brush.label);
+    for (const f of faces)
+      this.painted.paint(mesh.polygons[f], brush.tool === "eraser" ? null : brush.label);
     this.colour();
     this.draw();
     this.app.panel.paintedChanged();
     return true;
   }
 
-  /** Paints a part as the list has it: what the brush does, without a mouse. */
+  /** Paints a part of the list: does without a mouse what the brush does. */
   paintPart(highlight) {
     const mesh = this.scenes?.[0]?.mesh;
     if (!mesh?.polygons || this.brush.label === null) return;
     const covers = this.highlighted(mesh, highlight);
     this.painted.begin();
-    for (let f = 0; f < mesh.nFaces; f++) if (covers(f)) this.painted.paint(mesh.polygons[f], this.brush.label);
+    for (let f = 0; f < mesh.nFaces; f++)
+      if (covers(f)) this.painted.paint(mesh.polygons[f], this.brush.label);
     this.painted.end();
     this.colour();
     this.draw();
@@ -469,7 +521,7 @@ class Stage {
     this.repaint();
   }
 
-  /** Takes a stroke back, or does it again; false if there is none. */
+  /** Undoes or repeats a stroke. Returns false if there is none. */
   stroke(redo) {
     const moved = redo ? this.painted.redo() : this.painted.undo();
     if (moved) this.repaint();
@@ -482,7 +534,7 @@ class Stage {
     this.app.panel.paintedChanged();
   }
 
-  /** Runs of polygons with the same painted label: first, count, label. */
+  /** Returns runs of polygons with the same painted label: first, count, label. */
   runs() {
     const runs = [];
     const { labels } = this.painted;
@@ -496,7 +548,7 @@ class Stage {
   }
 }
 
-/** Connected pieces of one label, with their shares of the area. */
+/** Returns connected pieces of equal label, with their shares of the area. */
 function piecesOf(mesh) {
   const { nFaces, labels } = mesh;
   const normals = mesh.faceNormals;
@@ -519,14 +571,14 @@ function piecesOf(mesh) {
   return pieces;
 }
 
-/** Colour of each vertex: that of the label around it. */
+/** Returns the colour of each vertex: that of the labels around it. */
 function labelColours(mesh, app) {
   const of = new Int32Array(mesh.positions.length / 3).fill(-1);
   for (let c = 0; c < mesh.faces.length; c++) of[mesh.faces[c]] = mesh.labels[(c / 3) | 0];
   return (v) => app.colour(of[v]);
 }
 
-/** Colour of each vertex by its place, so that one sees where each goes. */
+/** Returns the colour of each vertex by its position, so that the map's targets can be seen. */
 function placeColours(mesh) {
   const p = mesh.positions;
   const low = [1, 1, 1];
@@ -535,5 +587,6 @@ function placeColours(mesh) {
     low[i % 3] = Math.min(low[i % 3], p[i]);
     high[i % 3] = Math.max(high[i % 3], p[i]);
   }
-  return (v) => [0, 1, 2].map((i) => 40 + (205 * (p[3 * v + i] - low[i])) / (high[i] - low[i] || 1));
+  return (v) =>
+    [0, 1, 2].map((i) => 40 + (205 * (p[3 * v + i] - low[i])) / (high[i] - low[i] || 1));
 }

@@ -1,4 +1,5 @@
-// What is painted on a shape, stroke by stroke: each can be undone and redone until it is sent.
+// Records what is painted on a shape, stroke by stroke. Each stroke can be undone and repeated
+// until it is sent.
 
 class Strokes {
   constructor() {
@@ -21,7 +22,7 @@ class Strokes {
     this.open = { before: new Map() };
   }
 
-  /** Paints a polygon within the stroke; null takes away what is painted. */
+  /** Paints a polygon within the stroke; null removes the painted label. */
   paint(polygon, label) {
     const { open, labels } = this;
     if (!open.before.has(polygon)) open.before.set(polygon, labels.get(polygon));
@@ -37,7 +38,7 @@ class Strokes {
     this.undone = [];
   }
 
-  /** Takes the newest stroke back, or does the newest one again that was; false if there is none. */
+  /** Moves the newest stroke of one list to the other. Returns false if there is none. */
   step(from, to) {
     this.end();
     const stroke = from.pop();

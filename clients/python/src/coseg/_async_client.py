@@ -24,7 +24,7 @@ from coseg.v1 import collection_pb2, event_pb2, message_pb2
 
 #: Longest single wait in the daemon, in milliseconds: so long a change of mind takes to be noticed.
 WAIT_MS = 1_000
-#: Seconds without a heartbeat after which a subscription is made anew; they come once a second.
+#: Seconds without a heartbeat after which a subscription is renewed; they come once a second.
 SILENCE_S = 3.0
 #: Seconds between tries while a daemon drains and another has not taken its place.
 DRAINING_RETRY_S = 0.5
