@@ -272,8 +272,7 @@ fn choose(
     let sources = judge.best(&refined, N_METRIC_SOURCES);
     let sources: Vec<&Vec<u32>> = sources.iter().map(|&c| &refined[c]).collect();
     if let Some(metric) = patchwise.metric(&sources, k) {
-        let features: Vec<Features> = shapes
-            .each()
+        let features: Vec<Features> = (shapes.input.shapes.par_iter())
             .map(|s| in_metric(s.features, &metric))
             .collect();
         let input = DiscoveryInput {

@@ -8,7 +8,7 @@
 //! limit.
 
 use super::criterion::Criterion;
-use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 /// Temperature of the softmax of the log concavities, which weights the candidates.
 const TEMPERATURE: f64 = 0.15;
@@ -37,7 +37,7 @@ impl<'a> Judge<'a> {
         k: usize,
     ) -> Self {
         let concavities: Vec<f64> = candidates
-            .iter()
+            .par_iter()
             .map(|l| criterion.log_concavity(&criterion.pair_sums(l, k)))
             .collect();
         let top = concavities
@@ -69,7 +69,7 @@ impl<'a> Judge<'a> {
     /// Returns the value of each labelling of all patches with labels below `k`.
     pub(super) fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
         labellings
-            .iter()
+            .par_iter()
             .zip(self.consensus(labellings, k))
             .map(|(l, c)| {
                 let sums = self.criterion.pair_sums(l, k);
@@ -100,49 +100,44 @@ impl<'a> Judge<'a> {
             .fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Returns, for each labelling, the mean normalised mutual information with the candidates.
-    /// Patches are weighted by area.
+    /// Returns, for each labelling, the mean normalised mutual information with the candidates,
+    /// `I(A; B) / √(H(A) H(B))` (Strehl and Ghosh 2002). Patches are weighted by area.
     fn consensus(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
-        let (mine, theirs) = (
-            self.indicator(labellings, k),
-            self.indicator(&self.candidates, self.k),
-        );
-        let joint = mine.transpose() * &theirs;
-        let entropy = |p: f64| if p > 0.0 { -p * p.ln() } else { 0.0 };
-        let own = |m: &DMatrix<f64>, c: usize, k: usize| -> f64 {
-            (0..k)
-                .map(|l| entropy(m.column(c * k + l).norm_squared()))
-                .sum()
+        let entropy = |shares: &[f64]| -> f64 {
+            let positive = shares.iter().filter(|p| **p > 0.0);
+            positive.map(|p| -p * p.ln()).sum()
         };
-        let their_own: Vec<f64> = (0..self.candidates.len())
-            .map(|c| own(&theirs, c, self.k))
+        let their_own: Vec<f64> = (self.candidates.iter())
+            .map(|theirs| {
+                let mut shares = vec![0.0; self.k];
+                self.add_shares(&mut shares, |p| theirs[p]);
+                entropy(&shares)
+            })
             .collect();
-        (0..labellings.len())
-            .map(|a| {
-                let my_own = own(&mine, a, k);
-                let agreement = |b: usize| {
-                    let block = joint.view((a * k, b * self.k), (k, self.k));
-                    let both: f64 = block.iter().map(|p| entropy(*p)).sum();
-                    (my_own + their_own[b] - both) / (my_own * their_own[b]).sqrt().max(1e-9)
-                };
-                (0..self.candidates.len())
-                    .map(|b| self.weights[b] * agreement(b))
-                    .sum()
+        labellings
+            .par_iter()
+            .map(|mine| {
+                let mut shares = vec![0.0; k];
+                self.add_shares(&mut shares, |p| mine[p]);
+                let my_own = entropy(&shares);
+                let mut joint = vec![0.0; k * self.k];
+                let agreements = self.candidates.iter().zip(&their_own).map(|(theirs, own)| {
+                    joint.fill(0.0);
+                    self.add_shares(&mut joint, |p| mine[p] * self.k as u32 + theirs[p]);
+                    (my_own + own - entropy(&joint)) / (my_own * own).sqrt().max(1e-9)
+                });
+                let weighted = agreements.zip(&self.weights).map(|(a, weight)| weight * a);
+                weighted.sum()
             })
             .collect()
     }
 
-    /// Returns a matrix whose column `c k + l` has the square roots of the area shares of the
-    /// patches with label l in labelling c.
-    fn indicator(&self, labellings: &[Vec<u32>], k: usize) -> DMatrix<f64> {
+    /// Adds the area share of each patch to its place in `shares`.
+    fn add_shares(&self, shares: &mut [f64], place: impl Fn(usize) -> u32) {
         let total: f64 = self.area.iter().sum();
-        let mut indicator = DMatrix::zeros(self.area.len(), labellings.len() * k);
-        for (c, labels) in labellings.iter().enumerate() {
-            for (p, l) in labels.iter().enumerate() {
-                indicator[(p, c * k + *l as usize)] = (self.area[p] / total).sqrt();
-            }
+        for (p, area) in self.area.iter().enumerate() {
+            shares[place(p) as usize] += area / total;
         }
-        indicator
     }
 }
 
