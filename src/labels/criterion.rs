@@ -22,7 +22,8 @@ pub(super) const CREASE_SCALE: f64 = 0.1;
 pub(super) struct Criterion {
     boundaries: Vec<(u32, u32, f64, f64)>,
     mean_crease: f64,
-    affinity: CsMat<f64>,
+    /// Affinity of each pair of patches that has one, the lower number first.
+    affinity: Vec<(u32, u32, f64)>,
 }
 
 /// Sums over pairs of labels `(k, k)`: length of boundaries, length weighted by crease, affinity.
@@ -70,7 +71,7 @@ impl Criterion {
         Self {
             boundaries,
             mean_crease: creased / length.max(1e-300),
-            affinity: combine(&inter, &intra, ALPHA),
+            affinity: pairs(&combine(&inter, &intra, ALPHA)),
         }
     }
 
@@ -89,9 +90,13 @@ impl Criterion {
                 sums.creased[at] += creased;
             }
         }
-        for (i, row) in self.affinity.outer_iterator().enumerate() {
-            for (j, w) in row.iter() {
-                sums.affinity[labels[i] as usize * k + labels[j] as usize] += w;
+        let mut once = vec![0.0; k * k];
+        for &(i, j, w) in &self.affinity {
+            once[labels[i as usize] as usize * k + labels[j as usize] as usize] += w;
+        }
+        for a in 0..k {
+            for b in 0..k {
+                sums.affinity[a * k + b] = once[a * k + b] + once[b * k + a];
             }
         }
         sums
@@ -118,6 +123,14 @@ impl Criterion {
             .sum();
         CONCAVITY_WEIGHT * self.log_concavity(sums) + modularity.max(1e-6).ln()
     }
+}
+
+/// The entries above the diagonal of a symmetric matrix.
+fn pairs(matrix: &CsMat<f64>) -> Vec<(u32, u32, f64)> {
+    let entries = matrix.iter().filter(|(_, (i, j))| i < j);
+    entries
+        .map(|(w, (i, j))| (i as u32, j as u32, *w))
+        .collect()
 }
 
 impl PairSums {

@@ -23,8 +23,9 @@ pub(super) struct Judge<'a> {
     /// Candidate labellings of all patches, and the softmax of their log concavities.
     candidates: Vec<Vec<u32>>,
     weights: Vec<f64>,
-    /// Area share of each patch, summing to the number of shapes.
+    /// Area share of each patch, summing to the number of shapes, and to 1.
     area: &'a [f64],
+    shares: Vec<f64>,
     concavity_weight: f64,
     k: usize,
 }
@@ -50,12 +51,14 @@ impl<'a> Judge<'a> {
             .collect();
         let sum: f64 = weights.iter().sum();
         weights.iter_mut().for_each(|w| *w /= sum);
+        let total: f64 = area.iter().sum();
         Self {
             criterion,
             candidates,
             weights,
             area,
-            concavity_weight: (area.iter().sum::<f64>() / FULL_WEIGHT_SHAPES).min(1.0),
+            concavity_weight: (total / FULL_WEIGHT_SHAPES).min(1.0),
+            shares: area.iter().map(|a| a / total).collect(),
             k,
         }
     }
@@ -132,11 +135,16 @@ impl<'a> Judge<'a> {
             .collect()
     }
 
-    /// Adds the area share of each patch to its place in `shares`.
+    /// Adds the area share of each patch to its place in `shares`. Neighbours in the list go to
+    /// different copies, since one sum waits for the other where both have the same place.
     fn add_shares(&self, shares: &mut [f64], place: impl Fn(usize) -> u32) {
-        let total: f64 = self.area.iter().sum();
-        for (p, area) in self.area.iter().enumerate() {
-            shares[place(p) as usize] += area / total;
+        const COPIES: usize = 4;
+        let mut copies = vec![[0.0; COPIES]; shares.len()];
+        for (p, share) in self.shares.iter().enumerate() {
+            copies[place(p) as usize][p % COPIES] += share;
+        }
+        for (share, copies) in shares.iter_mut().zip(&copies) {
+            *share += copies.iter().sum::<f64>();
         }
     }
 }

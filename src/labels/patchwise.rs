@@ -93,12 +93,12 @@ impl<'a> Patchwise<'a> {
                     (counts[l] / total.max(1e-300)).max(1e-9).ln() - half
                 })
                 .collect();
-            let scores = weights.transpose() * &self.means;
+            let scores = self.means.tr_mul(&weights);
             let mut next = Vec::with_capacity(labels.len());
             for (surface, range) in self.surfaces.iter().zip(self.offsets.windows(2)) {
                 let mut unary = Vec::with_capacity((range[1] - range[0]) * k);
                 for p in range[0]..range[1] {
-                    let row: Vec<f64> = (0..k).map(|l| scores[(l, p)] + bias[l]).collect();
+                    let row: Vec<f64> = (0..k).map(|l| scores[(p, l)] + bias[l]).collect();
                     let top = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
                     let log_sum = row.iter().map(|s| (s - top).exp()).sum::<f64>().ln() + top;
                     unary.extend(row.iter().map(|s| (log_sum - s).min(CAP_NATS)));
