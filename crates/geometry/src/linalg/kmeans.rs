@@ -56,7 +56,7 @@ const LANES: usize = 16;
 struct Points<'a> {
     rows: &'a [f64],
     dim: usize,
-    /// Value of each column of each row of a block, blocks one after the other; zeros fill the last.
+    /// Value of each column of each row of a block, block after block; zeros fill the last.
     blocks: Vec<[f64; LANES]>,
 }
 
@@ -241,7 +241,7 @@ mod tests {
         assert_eq!(kmeans(&[0.0, 1.0], 1, &[1.0, 1.0], 5, 0, 1), vec![0, 1]);
     }
 
-    /// The labels of a clustering depend on the last bits of distances where points lie between centres.
+    /// The last bits of distances decide the labels of points between centres.
     #[test]
     fn distances_are_the_plain_sums_to_the_bit() {
         let mut rng = Pcg64::seed_from_u64(3);
