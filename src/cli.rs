@@ -9,7 +9,7 @@ mod questions;
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, Usd, View};
-pub(crate) use maps::{Map, Transfer};
+pub(crate) use maps::{Map, Resolution, Transfer};
 pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
 
 use crate::commands::demo::DemoArgs;

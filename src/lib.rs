@@ -11,7 +11,8 @@
 
 // Geometry, a crate of its own: computes values from one or two meshes.
 pub use coseg_geometry::{
-    SpectralMesh, description, descriptors, fmap, linalg, mesh, operators, segmentation, spectrum,
+    SpectralMesh, description, descriptors, fmap, linalg, mesh, operators, segmentation, sites,
+    spectrum,
 };
 
 // Pure modules: values in, values out.

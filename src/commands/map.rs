@@ -3,7 +3,7 @@
 use super::render::pair;
 use super::session::Session;
 use super::{CommandError, Outcome, json};
-use crate::cli::Map;
+use crate::cli::{Map, Resolution};
 use coseg::call;
 use coseg::ipc::wire::{self, ArrayRef, DataType};
 use coseg::text::table;
@@ -20,9 +20,20 @@ pub(crate) fn run(args: &Map, mut session: Session) -> Outcome {
         to: args.to.clone(),
         points: args.points.then(|| options(&args.landmark, args.mirrored)),
         agreement: true,
+        resolution: wire::Resolution::Proxy.into(),
+    };
+    let at_rows = wire::GetFunctionalMapRequest {
+        agreement: false,
+        resolution: rows(args.resolution).into(),
+        ..request.clone()
     };
     let (map, frames) = call!(session.client, GetFunctionalMap(request), frames)?;
+    if !args.landmark.is_empty() {
+        check_rows(map.resolution(), Resolution::Proxy)?;
+    }
     if let Some(path) = &args.out {
+        let (map, frames) = call!(session.client, GetFunctionalMap(at_rows), frames)?;
+        check_rows(map.resolution(), args.resolution)?;
         write_arrays(
             path,
             &[
@@ -141,7 +152,31 @@ pub(super) fn options(landmarks: &[(u32, u32)], mirrored: bool) -> wire::PointMa
         orientation: orientation.into(),
         k: 0,
         alternative: true,
+        landmark_resolution: wire::Resolution::Input.into(),
     }
+}
+
+/// The rows of arrays as a request names them.
+pub(super) fn rows(resolution: Resolution) -> wire::Resolution {
+    match resolution {
+        Resolution::Input => wire::Resolution::Input,
+        Resolution::InputFaces => wire::Resolution::InputFaces,
+        Resolution::Proxy => wire::Resolution::Proxy,
+    }
+}
+
+/// Refuses arrays with other rows than requested, which older daemons send.
+pub(super) fn check_rows(found: wire::Resolution, wanted: Resolution) -> Result<(), CommandError> {
+    let wanted = rows(wanted);
+    if found == wanted {
+        return Ok(());
+    }
+    let text = format!(
+        "the daemon answers with rows of {}, not {}: it is older than this program",
+        found.as_str_name(),
+        wanted.as_str_name()
+    );
+    Err(CommandError::Failed(text))
 }
 
 /// The share with a counterpart, and the expected accuracy of transferred labels.

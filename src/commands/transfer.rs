@@ -1,4 +1,4 @@
-//! `coseg transfer` transfers labels or functions at the faces of one shape to another.
+//! `coseg transfer` transfers labels or functions at the faces or vertices of one shape to another.
 
 use super::session::{Session, print_line};
 use super::{CommandError, Outcome, map, values};
@@ -27,6 +27,7 @@ pub(crate) fn run(args: &Transfer, mut session: Session) -> Outcome {
             alternative: false,
             ..map::options(&args.landmark, args.mirrored)
         }),
+        resolution: map::rows(args.resolution).into(),
     };
     let frames = frames.finish();
     let (reply, frames) = call!(
@@ -35,6 +36,7 @@ pub(crate) fn run(args: &Transfer, mut session: Session) -> Outcome {
         frames,
         with_frames
     )?;
+    map::check_rows(reply.resolution(), args.resolution)?;
     let carried = convert::polygon_values(reply.values.as_ref(), FrameReader::new(&frames));
     let carried = carried.map_err(|e| CommandError::Failed(e.message))?;
     let quality = reply.quality.unwrap_or_default();

@@ -165,8 +165,6 @@ operations! {
         Fetch {
             GetOriginal(GetOriginalRequest),
             LabelsSnapshot(LabelsSnapshotRequest),
-            GetSpectrum(GetSpectrumRequest),
-            GetHks(GetHksRequest),
             GetDescriptors(GetDescriptorsRequest),
         }
         /// Changes in order with additions.
@@ -184,6 +182,8 @@ operations! {
     of_one_collection {
         /// Computed from shapes in a worker, unless the result is stored.
         Compute {
+            GetSpectrum(GetSpectrumRequest) checked by check_spectrum,
+            GetHks(GetHksRequest) checked by check_hks,
             GetFunctionalMap(GetFunctionalMapRequest) checked by check_map,
             TransferFunction(TransferFunctionRequest) checked by check_transfer,
             GetPartCorrespondence(GetPartCorrespondenceRequest),
@@ -231,7 +231,10 @@ impl Operation {
     /// The cost of reading its answer from rows and arrays.
     pub(crate) fn cost(&self) -> Cost {
         match self {
-            Self::Fetch(_) | Self::Compute(Compute::GetPortraits(_)) => Cost::Bulk,
+            Self::Fetch(_)
+            | Self::Compute(
+                Compute::GetPortraits(_) | Compute::GetSpectrum(_) | Compute::GetHks(_),
+            ) => Cost::Bulk,
             _ => Cost::Short,
         }
     }

@@ -8,7 +8,7 @@ use crate::daemon::status;
 use crate::ipc::convert;
 use crate::ipc::frames::FrameWriter;
 use crate::ipc::wire::{self, ErrorReason, reply::Result as Reply};
-use crate::library::{Job, JobFilter, Library, LibraryError};
+use crate::library::{Job, JobFilter, Library, LibraryError, Resolution};
 use bytes::Bytes;
 
 /// Answers from rows.
@@ -66,23 +66,6 @@ pub(crate) fn fetch(daemon: &Daemon, fetch: Fetch) -> Answer {
             let (sequence, shapes) = library.labels_snapshot(&r.collection).map_err(refused)?;
             Reply::LabelsSnapshot(convert::labels_snapshot(sequence, &shapes, &mut frames))
         }
-        Fetch::GetSpectrum(r) => {
-            let area = library
-                .shape(&r.collection, &r.shape)
-                .map_err(refused)?
-                .area;
-            let description = library
-                .description(&r.collection, &r.shape)
-                .map_err(refused)?;
-            let view = description.view();
-            Reply::GetSpectrum(convert::spectrum(&view, area, r.eigenvectors, &mut frames))
-        }
-        Fetch::GetHks(r) => {
-            let description = library
-                .description(&r.collection, &r.shape)
-                .map_err(refused)?;
-            Reply::GetHks(convert::hks(&description.view(), &mut frames))
-        }
         Fetch::GetDescriptors(r) => {
             let description = library
                 .description(&r.collection, &r.shape)
@@ -98,12 +81,59 @@ pub(crate) type Stored = Option<(Reply, Vec<Bytes>)>;
 
 /// The answer to a computation, if it is stored.
 pub(crate) fn stored(daemon: &Daemon, compute: &Compute) -> Result<Stored, wire::Error> {
-    let Compute::GetFunctionalMap(r) = compute else {
-        return Ok(None);
-    };
+    let library = &daemon.library;
     let mut frames = FrameWriter::default();
-    let reply = stored_map(&daemon.library, r, &mut frames)?;
-    Ok(reply.map(|reply| (Reply::GetFunctionalMap(reply), frames.finish())))
+    let reply = match compute {
+        Compute::GetFunctionalMap(r) => {
+            stored_map(library, r, &mut frames)?.map(Reply::GetFunctionalMap)
+        }
+        Compute::GetSpectrum(r) => {
+            stored_spectrum(library, r, &mut frames)?.map(Reply::GetSpectrum)
+        }
+        Compute::GetHks(r) if on_proxy(r.resolution()) => {
+            let description = library.description(&r.collection, &r.shape);
+            let description = description.map_err(refused)?;
+            Some(Reply::GetHks(convert::hks(
+                &description.view(),
+                &mut frames,
+            )))
+        }
+        _ => None,
+    };
+    Ok(reply.map(|reply| (reply, frames.finish())))
+}
+
+/// Whether the rows that a request wants are those of the proxy, where arrays are stored.
+fn on_proxy(wanted: wire::Resolution) -> bool {
+    convert::resolution(wanted, Resolution::Proxy) == Resolution::Proxy
+}
+
+/// The requested spectrum, if its arrays are stored: the eigenvalues are, at every resolution.
+fn stored_spectrum(
+    library: &Library,
+    r: &wire::GetSpectrumRequest,
+    frames: &mut FrameWriter,
+) -> Result<Option<wire::GetSpectrumReply>, wire::Error> {
+    if r.eigenvectors && !on_proxy(r.resolution()) {
+        return Ok(None);
+    }
+    let (collection, shape) = (&r.collection, &r.shape);
+    let area = library.shape(collection, shape).map_err(refused)?.area;
+    let description = library.description(collection, shape).map_err(refused)?;
+    let reply = convert::spectrum(&description.view(), area, r.eigenvectors, frames);
+    Ok(Some(wire::GetSpectrumReply {
+        // Eigenvalues have no rows.
+        resolution: match r.eigenvectors {
+            true => reply.resolution,
+            false => r.resolution,
+        },
+        ..reply
+    }))
+}
+
+/// Whether landmarks are vertices of the meshes as sent.
+fn names_vertices(points: &wire::PointMapOptions) -> bool {
+    !points.landmarks.is_empty() && points.landmark_resolution() == wire::Resolution::Input
 }
 
 /// The requested map, if it is stored.
@@ -112,8 +142,13 @@ fn stored_map(
     r: &wire::GetFunctionalMapRequest,
     frames: &mut FrameWriter,
 ) -> Result<Option<wire::GetFunctionalMapReply>, wire::Error> {
+    if !on_proxy(r.resolution()) {
+        return Ok(None);
+    }
     let (collection, from, to) = (&r.collection, &r.from, &r.to);
     let found = match &r.points {
+        // Landmarks on the meshes as sent must be located first.
+        Some(points) if names_vertices(points) => None,
         Some(points) => library
             .stored_point_maps(collection, from, to, &convert::point_request(points))
             .map_err(refused)?
@@ -129,7 +164,7 @@ fn stored_map(
     let n1 = library
         .n_proxy_vertices(collection, from)
         .map_err(refused)?;
-    Ok(Some(convert::from_vertices(found, n1)))
+    Ok(Some(convert::from_rows(found, n1, Resolution::Proxy)))
 }
 
 fn list_shapes(

@@ -122,13 +122,22 @@ fn run(
 
 /// Bytes of the mesh files that are read for the work.
 fn n_bytes_read(daemon: &Daemon, work: &Remote) -> u64 {
-    let Remote::Compute(Compute::GetPortraits(r)) = work else {
+    let Remote::Compute(compute) = work else {
         return 0;
     };
-    if r.detail() != wire::PortraitDetail::Surface {
-        return 0;
-    }
-    let length = |name: &String| daemon.library.original_length(&r.collection, name);
+    let names: Vec<&String> = match compute {
+        Compute::GetPortraits(r) if r.detail() == wire::PortraitDetail::Surface => {
+            r.shapes.iter().collect()
+        }
+        // Arrays on the proxy are stored: these are of the mesh as sent.
+        Compute::GetSpectrum(r) => vec![&r.shape],
+        Compute::GetHks(r) => vec![&r.shape],
+        // Files are read for some of these.
+        Compute::GetFunctionalMap(r) => vec![&r.from, &r.to],
+        Compute::TransferFunction(r) => vec![&r.from, &r.to],
+        _ => Vec::new(),
+    };
+    let length = |name: &&String| daemon.library.original_length(compute.collection(), name);
     // A missing shape is refused by the worker.
-    r.shapes.iter().filter_map(|name| length(name).ok()).sum()
+    names.iter().filter_map(|name| length(name).ok()).sum()
 }

@@ -40,6 +40,7 @@ DAEMONS: dict[str, dict[str, str]] = {
         "COSEG__LIMITS__MAX_SHAPES_PER_REQUEST": "2",
     },
     "tcp": {},
+    "asking": {},
 }
 
 
@@ -136,6 +137,10 @@ def mask(reply: message_pb2.Reply) -> None:
             for item in getattr(reply, body).job.items:
                 for stage in item.placed.stages:
                     stage.ms = 1.5
+    if reply.HasField("list_shapes"):
+        for shape in reply.list_shapes.shapes:
+            if shape.review.unix_ms:
+                shape.review.unix_ms = 1
 
 
 class Recorder:
@@ -195,6 +200,14 @@ class Recorder:
         answer[0] = reply.SerializeToString()
         self.keep(name, shows, sent, answer, "recorded")
         return reply
+
+    def settle(self, collection: str) -> None:
+        """Waits, unrecorded, until changes have been propagated: what follows has their versions."""
+        assert self.daemon is not None
+        request = message_pb2.Request(request_id="settle", client_id="")
+        request.wait_idle.collection, request.wait_idle.wait_ms = collection, 20_000
+        answer = message_pb2.Reply.FromString(self.daemon.exchange([request.SerializeToString()])[0])
+        assert answer.wait_idle.idle, answer
 
     def compose(self, reason: str, code: str, message: str, **more: Any) -> None:
         """A refusal that cannot be brought about at will."""
@@ -324,6 +337,7 @@ def plain(r: Recorder) -> None:
         get_part_correspondence={**of, "shape_a": "a", "shape_b": "b"},
     )
     r.say("nearest", "neighbours", nearest={**one, "limit": 3})
+    sent(r)
     r.say("events_since", "the whole log", events_since=of)
     r.say("events_since_limit", "one event, and that there are more", events_since={**of, "limit": 1})
     r.say("suggest_next", "the shape to label next", suggest_next=of)
@@ -336,6 +350,7 @@ def plain(r: Recorder) -> None:
         [int32(*labels)],
         correct_labels={**one, "labels": ref},
     )
+    r.settle("things")
     some = {"dtype": "DATA_TYPE_UINT32", "shape": [2], "frame": 0}
     r.say(
         "correct_labels_faces",
@@ -343,11 +358,15 @@ def plain(r: Recorder) -> None:
         [int32(5, 6)],
         correct_labels={**one, "faces": {"faces": some, "label": 8}},
     )
+    r.settle("things")
     r.say("correct_labels_part", "a part", correct_labels={**one, "part": {"part": 0, "label": 7}})
+    r.settle("things")
     r.say("name_label", "a label gets a name", name_label={**of, "label": 7, "name": "head"})
     r.say("merge_labels", "8 is 7 from now on", merge_labels={**of, "label": 8, "into": 7})
+    r.settle("things")
     r.say("error_label_merged", "a label that was merged cannot be split", split_label={**of, "label": 8})
     r.say("split_label", "two of one", split_label={**of, "label": 7})
+    r.settle("things")
     r.say("undo", "the split is taken back", undo=of)
     r.say("wait_idle_after_undo", "the other shape has followed", wait_idle={**of, "wait_ms": 20000})
     r.say("update_collection", "another up axis", update_collection={**of, "up": "UP_PLUS_Z"})
@@ -446,15 +465,96 @@ def plain(r: Recorder) -> None:
     )
     everything = [0] * (N_FACES // 2) + [1] * (N_FACES - N_FACES // 2)
     r.say("correct_labels_all", "a whole shape", [int32(*everything)], correct_labels={**one, "labels": ref})
+    r.settle("things")
     r.say(
         "correct_labels_other",
         "and the other",
         [int32(*everything)],
         correct_labels={**of, "shape": "b", "labels": ref},
     )
+    r.settle("things")
     r.say("error_nothing_to_suggest", "a person labelled every shape", suggest_next=of)
     r.say("remove_shape", "a shape goes", remove_shape={**of, "shape": "b"})
     r.say("delete_collection", "a collection goes", delete_collection={"collection": "boxes"})
+
+
+def sent(r: Recorder) -> None:
+    """Arrays of the meshes as they were sent."""
+    of, rows = {"collection": "things"}, {"resolution": "RESOLUTION_INPUT"}
+    one, pair = {**of, "shape": "a", **rows}, {**of, "from": "a", "to": "b"}
+    r.say(
+        "get_spectrum_input",
+        "eigenvectors and mass at the vertices of the file",
+        get_spectrum={**one, "eigenvectors": True},
+    )
+    r.say("get_hks_input", "a row for each vertex of the file", get_hks=one)
+    faces = {"resolution": "RESOLUTION_INPUT_FACES"}
+    r.say("get_hks_input_faces", "a row for each face of the file", get_hks={**one, **faces})
+    r.say(
+        "get_functional_map_input",
+        "p2p_21 between the vertices of the files",
+        get_functional_map={**pair, **rows},
+    )
+    landmarks = {"landmarks": [{"from": 0, "to": 0}], "landmark_resolution": "RESOLUTION_INPUT"}
+    r.say(
+        "get_functional_map_landmarks",
+        "a map between points with a landmark, vertices of the files",
+        get_functional_map={**pair, **rows, "points": landmarks},
+    )
+    past = {**landmarks, "landmarks": [{"from": 9999, "to": 0}]}
+    r.say(
+        "error_landmark",
+        "a landmark that is not there: both numbers are named",
+        get_functional_map={**pair, **rows, "points": past},
+    )
+    n = len(skittle(0).split(b"\n")) - 3 - N_FACES
+    ids = {"dtype": "DATA_TYPE_INT32", "frame": 0}
+    r.say(
+        "transfer_function",
+        "labels from faces to faces",
+        [int32(*range(N_FACES))],
+        transfer_function={**pair, "values": {**ids, "shape": [N_FACES]}},
+    )
+    r.say(
+        "transfer_function_input",
+        "labels from the vertices of one file to those of the other",
+        [int32(*range(n))],
+        transfer_function={**pair, **rows, "values": {**ids, "shape": [n]}},
+    )
+    r.say(
+        "error_values_length",
+        "a value too few: both lengths are named",
+        [int32(*range(n - 1))],
+        transfer_function={**pair, **rows, "values": {**ids, "shape": [n - 1]}},
+    )
+
+
+def asking(r: Recorder) -> None:
+    """A person answers questions and gives verdicts."""
+    of = {"collection": "asked"}
+    a, b = skittle(0), skittle(3)
+    two = {"n_parts": 2, "working_faces": WORKING_FACES}
+    r.say(
+        "add_shapes_asked", "two files", [a, b], **add([encoded("a"), encoded("b", 1)], "asked", create=two)
+    )
+    r.say("next_question", "the part whose label is worth most", next_question=of)
+    part = {**of, "shape": "a", "part": 0, "by": "ada"}
+    r.say("answer_question", "a name, which makes a label", answer_question={**part, "named": "head"})
+    r.settle("asked")
+    other = {**part, "shape": "b"}
+    r.say("answer_question_passed", "a part is passed over", answer_question={**other, "skip": True})
+    r.say("error_question_part", "a part that is not there", answer_question={**part, "part": 999, "label": 1})
+    of_b = {**of, "shape": "b", "by": "ada"}
+    r.say("review_shape", "a doubt is noted", review_shape={**of_b, "state": "REVIEW_STATE_DOUBTFUL"})
+    r.say("list_shapes_doubtful", "shapes with that verdict", list_shapes={**of, "review": "REVIEW_STATE_DOUBTFUL"})
+    for shape in ("a", "b"):
+        r.say(
+            f"review_shape_{shape}",
+            "all labels are right: they are pinned",
+            review_shape={**of_b, "shape": shape, "state": "REVIEW_STATE_APPROVED"},
+        )
+        r.settle("asked")
+    r.say("error_nothing_to_ask", "a person labelled every part", next_question={**of, "passed": True})
 
 
 def small(r: Recorder) -> None:
@@ -533,7 +633,7 @@ def composed(r: Recorder) -> None:
 def main() -> None:
     """Records all of it."""
     recorder = Recorder()
-    for name, conversations in (("plain", plain), ("small", small), ("tcp", tcp)):
+    for name, conversations in (("plain", plain), ("small", small), ("tcp", tcp), ("asking", asking)):
         recorder.daemon, recorder.daemon_name = Daemon(sys.argv[1], name), name
         try:
             conversations(recorder)

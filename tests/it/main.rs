@@ -14,6 +14,7 @@ mod hostile;
 mod maps;
 mod old_store;
 mod pipeline;
+mod resolution;
 mod side_by_side;
 mod snapshot;
 mod spectra;

@@ -74,6 +74,7 @@ fn a_snapshot_while_shapes_come_in_restores_to_the_byte() {
                 collection,
                 shape,
                 eigenvectors: true,
+                ..Default::default()
             };
             let labels = call!(client, GetLabels(labels), frames).unwrap();
             (

@@ -32,6 +32,9 @@ ELSEWHERE = {
     "events_since.more": "the client reads page after page",
 }
 
+#: The first that a reply's field may say: the others are refused.
+PROXY: Any = {"resolution": "proxy"}
+
 Call = Callable[[coseg.Library, coseg.Collection], object]
 CALLS: dict[str, Call] = {
     "hello": lambda lib, _: lib.hello(),
@@ -56,14 +59,16 @@ CALLS: dict[str, Call] = {
     "get_original": lambda _, c: c.original("a"),
     "remove_shape": lambda _, c: c.remove("a"),
     "labels_snapshot": lambda _, c: c.snapshot(),
-    "get_spectrum": lambda _, c: c.spectrum("a", eigenvectors=True),
-    "get_hks": lambda _, c: c.hks("a"),
+    "get_spectrum": lambda _, c: or_refusal(lambda: c.spectrum("a", eigenvectors=True, **PROXY)),
+    "get_hks": lambda _, c: or_refusal(lambda: c.hks("a", **PROXY)),
     "get_descriptors": lambda _, c: c.descriptors("a"),
-    "get_functional_map": lambda _, c: c.map("a", "b", alternative=True, agreement=True),
+    "get_functional_map": lambda _, c: or_refusal(
+        lambda: c.map("a", "b", alternative=True, agreement=True, **PROXY)
+    ),
     "get_part_correspondence": lambda _, c: c.match_parts("a", "b"),
     "nearest": lambda _, c: c.nearest("a"),
     "get_portraits": lambda _, c: c.portraits(["a"]),
-    "transfer_function": lambda _, c: c.transferred(np.zeros((2, 2)), "a", "b"),
+    "transfer_function": lambda _, c: or_refusal(lambda: c.transferred(np.zeros((2, 2)), "a", "b", **PROXY)),
     "events_since": lambda _, c: c.events_since(0, limit=N),
     "correct_labels": lambda _, c: c.correct("a", part=0, label=1),
     "merge_labels": lambda _, c: c.merge(1, into=2),
@@ -74,6 +79,14 @@ CALLS: dict[str, Call] = {
     "answer_question": lambda _, c: c.answer("a", 0, 1),
     "review_shape": lambda _, c: c.approve("a"),
 }
+
+
+def or_refusal(call: Callable[[], object]) -> object:
+    """What a call returns, or says of a reply with other rows than were asked for."""
+    try:
+        return call()
+    except coseg.BadReply as refusal:
+        return refusal
 
 
 def first(entries: Iterator[object]) -> list[object]:

@@ -80,14 +80,11 @@ def test_there_are_enough_and_every_reason_is_shown() -> None:
     assert len(INDEX) >= 40
     text = json.dumps(INDEX)
     # A reason that is missing here was added to the protocol: run tests/golden/record.py.
-    # Not recorded yet: tests/it/asking.rs has them.
-    unrecorded = {"ERROR_REASON_NOTHING_TO_ASK", "answer_question", "next_question", "review_shape"}
-    reasons = [name for name in error_pb2.ErrorReason.keys()[1:] if name not in unrecorded]
-    missing = [name for name in reasons if f'"{name}"' not in text]
+    missing = [name for name in error_pb2.ErrorReason.keys()[1:] if f'"{name}"' not in text]
     assert missing == []
     bodies = {name for entry in INDEX for name in entry["reply"] if name != "request_id"}
     fields = message_pb2.Reply.DESCRIPTOR.oneofs_by_name["result"].fields
-    assert sorted({f.name for f in fields} - bodies - unrecorded) == []
+    assert sorted({f.name for f in fields} - bodies) == []
 
 
 @pytest.mark.parametrize("entry", INDEX, ids=[e["name"] for e in INDEX])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_shapes_tell_what_they_are(chairs: coseg.Collection, meshes: list[Path])
 
 def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path]) -> None:
     a, b = meshes[0].stem, meshes[1].stem
-    spectrum = chairs.spectrum(a, eigenvectors=True)
+    spectrum = chairs.spectrum(a, eigenvectors=True, resolution="proxy")
     assert spectrum.eigenvalues.dtype == np.float64
     assert (np.diff(spectrum.eigenvalues) >= 0).all() and abs(spectrum.eigenvalues[0]) < 1e-6
     assert spectrum.eigenvectors is not None and spectrum.mass is not None
@@ -95,14 +96,14 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert np.abs(gram - np.eye(len(gram))).max() < 1e-3
     assert chairs.spectrum(a).eigenvectors is None
     proxy = chairs.descriptors(a)
-    assert chairs.hks(a).shape[0] == len(proxy.vertices) == len(phi)
+    assert chairs.hks(a, resolution="proxy").shape[0] == len(proxy.vertices) == len(phi)
     assert proxy.face_map.shape == (len(chairs.labels(a)),)
-    fmap = chairs.library.map(a, b, "chairs")
+    fmap = chairs.library.map(a, b, "chairs", resolution="proxy")
     n_b = len(chairs.descriptors(b).vertices)
     assert fmap.p2p_21.shape == (n_b,) and fmap.p2p_21.max() < len(proxy.vertices)
     # c_12 maps what p2p_21 maps: pulling a smooth function back agrees with its coefficients.
     k2, k1 = fmap.c_12.shape
-    target = chairs.spectrum(b, eigenvectors=True)
+    target = chairs.spectrum(b, eigenvectors=True, resolution="proxy")
     assert target.eigenvectors is not None and target.mass is not None
     pulled = target.eigenvectors[:, :k2].T @ (target.mass[:, None] * fmap.carry(phi[:, :k1]))
     assert np.abs(pulled - fmap.c_12).max() < 0.05
@@ -110,7 +111,7 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert fmap.n1 == len(proxy.vertices)
     for wrong in (phi[:-1], np.zeros(fmap.n1 + 1), np.zeros(len(proxy.faces)), np.zeros(())):
         n = len(wrong) if wrong.ndim else 0
-        with pytest.raises(ValueError, match=f"values have {n} rows, .* has {fmap.n1} vertices"):
+        with pytest.raises(ValueError, match=f"values have {n} rows, .* has {fmap.n1}, one for each vertex"):
             fmap.carry(wrong)
     assert fmap.quality.coverage > 0
     assert fmap.quality.expected_error is None
@@ -120,16 +121,16 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     agreement = chairs.map(a, b, agreement=True).agreement
     assert agreement is not None and (agreement.n_triangles > 1 or not agreement.inconsistent)
     # One for points, and what it carries: constants, and labels as good as those that are there.
-    dense = chairs.library.map(a, b, "chairs", points=True)
+    dense = chairs.library.map(a, b, "chairs", points=True, resolution="proxy")
     assert dense.p2p_21.shape == (n_b,) and 0 < (dense.quality.expected_error or 0) < 1
-    turned = chairs.map(a, b, orientation="reverse", k=30, alternative=True)
+    turned = chairs.map(a, b, orientation="reverse", k=30, alternative=True, resolution="proxy")
     assert turned.c_12.shape == (30, 30) and (turned.quality.orientation or 0) < 0
     other = turned.alternative
     assert other is not None and other.c_12.shape == (30, 30) and (other.quality.orientation or 0) > 0
     assert turned.alternative_cost is not None and other.p2p_21.shape == (n_b,)
     with pytest.raises(ValueError, match="orientation is 'left'"):
         chairs.map(a, b, orientation="left")
-    pinned = chairs.map(a, b, landmarks=[(int(dense.p2p_21[0]), 0)])
+    pinned = chairs.map(a, b, landmarks=[(int(dense.p2p_21[0]), 0)], resolution="proxy")
     assert pinned.quality.expected_error is not None
     n_faces = len(chairs.labels(a)), len(chairs.labels(b))
     both = chairs.transferred(np.ones((n_faces[0], 2)), a, b)
@@ -142,6 +143,80 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert matches.matches and matches.matches[0].overlap > 0
     nearest = chairs.nearest(a, limit=2)
     assert len(nearest) == 2 and nearest[0].distance <= nearest[1].distance
+
+
+@pytest.fixture
+def coarse(shared: Daemon, meshes: list[Path]) -> Iterator[coseg.Collection]:
+    """Two chairs whose working meshes are coarser than their files."""
+    with coseg.Library(shared.endpoint) as lib:
+        lib.create("coarse", parts=4, up="+y", working_faces=500)
+        collection = lib.collection("coarse")
+        assert all(added.ok for added in collection.add_many(meshes[:2]))
+        yield collection
+
+
+def test_arrays_are_of_the_mesh_as_it_was_sent(coarse: coseg.Collection, meshes: list[Path]) -> None:
+    chairs = coarse
+    a, b = meshes[0].stem, meshes[1].stem
+    one, two = coseg.read_mesh(meshes[0]), coseg.read_mesh(meshes[1])
+    n, n_b = len(one.vertices), len(two.vertices)
+    proxy = chairs.descriptors(a)
+    assert n > len(proxy.vertices) + 100
+    spectrum = chairs.spectrum(a, eigenvectors=True)
+    assert spectrum.eigenvectors is not None and spectrum.mass is not None
+    assert len(spectrum.eigenvectors) == len(spectrum.mass) == n
+    assert spectrum.mass.sum() == pytest.approx(1, abs=1e-4)
+    # What is interpolated is nearly what it is there: the first is constant, the others orthonormal.
+    phi = spectrum.eigenvectors[:, :10].astype(np.float64)
+    assert np.allclose(phi[:, 0], phi[0, 0], rtol=1e-4)
+    assert np.abs(phi.T @ (spectrum.mass[:, None] * phi) - np.eye(10)).max() < 0.1
+    hks, of_faces = chairs.hks(a), chairs.hks(a, resolution="input_faces")
+    assert len(hks) == n and len(of_faces) == one.n_polygons
+    # Where the working mesh has kept a vertex of the file, the value is the same, to the bit.
+    rows = {row.tobytes(): v for v, row in enumerate(hks)}
+    own = [row.tobytes() for row in chairs.hks(a, resolution="proxy")]
+    kept = np.array([(i, rows[row]) for i, row in enumerate(own) if row in rows])
+    assert len(kept) > 0.95 * len(own)
+    places = [proxy.vertices[kept[:, 0]].astype(np.float64), one.vertices[kept[:, 1]]]
+    there, here = (p - p.mean(axis=0) for p in places)
+    assert np.allclose(there / np.linalg.norm(there), here / np.linalg.norm(here), atol=1e-5)
+
+    fmap = chairs.map(a, b)
+    assert (fmap.n1, len(fmap.p2p_21), fmap.resolution) == (n, n_b, "input")
+    assert fmap.confidence is not None and len(fmap.confidence) == len(fmap.matched) == n_b
+    assert np.array_equal(fmap.carry(np.arange(n)), fmap.p2p_21)
+    with pytest.raises(ValueError, match=f"values have {n_b} rows, .* has {n}, one for each vertex"):
+        fmap.carry(np.zeros(n_b))
+    faces = chairs.map(a, b, resolution="input_faces", points=True, alternative=True)
+    assert (faces.n1, len(faces.p2p_21)) == (one.n_polygons, two.n_polygons)
+    assert faces.alternative is not None and len(faces.alternative.p2p_21) == two.n_polygons
+
+    # Constants stay, wherever something corresponds.
+    ones = chairs.transfer(np.ones((n, 2)), a, b, resolution="input")
+    matched = ~np.isnan(ones[:, 0])
+    assert ones.shape == (n_b, 2) and matched.mean() > 0.5 and np.allclose(ones[matched], 1, atol=1e-5)
+    ids = chairs.transfer(np.arange(n), a, b, resolution="input")
+    dense = chairs.map(a, b, points=True)
+    assert np.array_equal(ids, np.where(dense.matched, dense.p2p_21.astype(np.int32), -1))
+    assert np.array_equal(ids >= 0, matched)
+    n_proxy = len(proxy.vertices)
+    assert len(chairs.transfer(np.arange(n_proxy), a, b, resolution="proxy")) == len(
+        chairs.descriptors(b).vertices
+    )
+    itself = chairs.map(a, a, points=True)
+    assert (itself.p2p_21 == np.arange(n)).mean() > 0.95
+
+    # Landmarks are vertices of the files.
+    pinned = chairs.map(a, b, landmarks=[(n - 1, n_b - 1)])
+    assert pinned.quality.expected_error is not None
+    with pytest.raises(coseg.InvalidArgument, match=f"vertex {n}, but the file of .* has {n} vertices"):
+        chairs.map(a, b, landmarks=[(n, 0)])
+    of = (("input", n - 1, n), ("proxy", n, n_proxy), ("input_faces", n, one.n_polygons))
+    for resolution, wrong, has in of:
+        with pytest.raises(coseg.InvalidArgument, match=f"values have {wrong} rows, but .* has {has}"):
+            chairs.transfer(np.zeros(wrong), a, b, resolution=resolution)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="resolution is 'output'"):
+        chairs.hks(a, resolution="output")  # type: ignore[arg-type]
 
 
 def test_the_one_line_of_a_map(daemon: Daemon, meshes: list[Path]) -> None:

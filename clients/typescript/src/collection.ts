@@ -10,7 +10,18 @@ import { EventSchema } from "./gen/coseg/v1/event_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
 import { ReviewState } from "./gen/coseg/v1/review_pb.js";
 import { PACE_MS, WAIT_MS, type Library } from "./library.js";
-import { added, failed, functionalMap, job, mapQuality, pointOptions, present, up } from "./replies.js";
+import {
+  added,
+  checkResolution,
+  failed,
+  functionalMap,
+  job,
+  mapQuality,
+  pointOptions,
+  present,
+  up,
+  wireResolution,
+} from "./replies.js";
 import type { Subscription } from "./transport.js";
 import type {
   Added,
@@ -30,6 +41,7 @@ import type {
   Neighbor,
   PartMatches,
   Points,
+  Rows,
   Question,
   Settings,
   Shape,
@@ -265,11 +277,17 @@ export class Collection {
     return raw.file(reply.pack);
   }
 
-  /** Eigenvalues and, optionally, eigenvectors and mass. */
-  async spectrum(name: string, options: { eigenvectors?: boolean } = {}): Promise<Spectrum> {
-    const { eigenvectors = false } = options;
-    const request = { collection: this.name, shape: name, eigenvectors };
+  /**
+   * Eigenvalues and, optionally, eigenvectors and mass: a row for each vertex of the mesh as sent, or
+   * as the resolution says. On the working mesh ("proxy") the eigenvectors are orthonormal; at other
+   * resolutions they are interpolated, and NaN at vertices without a face.
+   */
+  async spectrum(name: string, options: { eigenvectors?: boolean } & Rows = {}): Promise<Spectrum> {
+    const { eigenvectors = false, resolution = "input" } = options;
+    const rows = { resolution: wireResolution(resolution) };
+    const request = { collection: this.name, shape: name, eigenvectors, ...rows };
     const [reply, raw] = await this.library.call("getSpectrum", request);
+    if (eigenvectors) checkResolution(reply.resolution, resolution);
     return {
       eigenvalues: raw.array(Float64Array, reply.eigenvalues).data,
       ...(reply.eigenvectors && { eigenvectors: raw.array(Float32Array, reply.eigenvectors) }),
@@ -278,9 +296,14 @@ export class Collection {
     };
   }
 
-  /** (n, t) heat kernel signature: a row for each vertex of the working mesh. */
-  async hks(name: string): Promise<Matrix<Float32Array>> {
-    const [reply, raw] = await this.library.call("getHks", { collection: this.name, shape: name });
+  /**
+   * (n, t) heat kernel signature: a row for each vertex of the mesh as sent, or as the resolution
+   * says.
+   */
+  async hks(name: string, { resolution = "input" }: Rows = {}): Promise<Matrix<Float32Array>> {
+    const request = { collection: this.name, shape: name, resolution: wireResolution(resolution) };
+    const [reply, raw] = await this.library.call("getHks", request);
+    checkResolution(reply.resolution, resolution);
     return raw.array(Float32Array, reply.hks);
   }
 
@@ -301,20 +324,38 @@ export class Collection {
   /**
    * The functional map that transfers functions on `from` to functions on `to`, and the pointwise
    * map back: the stored part map that propagates labels, or, with options of {@link Points}, a map
-   * between points, computed in about 0.1 s.
+   * between points, computed in about 0.1 s. The pointwise map is between the vertices of the meshes
+   * as sent, or as the resolution says.
    */
   async map(from: string, to: string, options?: MapOptions): Promise<FunctionalMap> {
-    const wish = options && ("agreement" in options ? options : { points: pointOptions(options) });
-    const [reply, raw] = await this.library.call("getFunctionalMap", { collection: this.name, from, to, ...wish });
-    return functionalMap(from, to, reply, raw);
+    const { resolution = "input", ...wish } = options ?? {};
+    const onlyRows = options?.resolution !== undefined && Object.keys(wish).length === 0;
+    const request = {
+      collection: this.name,
+      from,
+      to,
+      resolution: wireResolution(resolution),
+      ...("agreement" in wish && { agreement: wish.agreement }),
+      ...(options && !onlyRows && !("agreement" in wish) && { points: pointOptions(wish, resolution) }),
+    };
+    const [reply, raw] = await this.library.call("getFunctionalMap", request);
+    checkResolution(reply.resolution, resolution);
+    return functionalMap(from, to, resolution, reply, raw);
   }
 
   /**
    * Transfers values at the faces of `from` to those of `to`, by a map between points. An
    * Int32Array has one label for each face, transferred by majority; a Float32Array has one or more
-   * values for each face, which are averaged.
+   * values for each face, which are averaged. With the resolution "input" values are at the vertices
+   * of the meshes as sent: labels are those of the corresponding vertex, numbers are interpolated;
+   * with "proxy" at the vertices of the working meshes.
    */
-  async transfer<T extends Int32Array | Float32Array>(values: T, from: string, to: string, points: Points = {}): Promise<T> {
+  async transfer<T extends Int32Array | Float32Array>(
+    values: T,
+    from: string,
+    to: string,
+    points: Points & Rows = {},
+  ): Promise<T> {
     return (await this.transferred(values, from, to, points)).values;
   }
 
@@ -323,20 +364,29 @@ export class Collection {
     values: T,
     from: string,
     to: string,
-    points: Points = {},
+    points: Points & Rows = {},
   ): Promise<Transferred<T>> {
     const writer = new FrameWriter();
+    const { resolution = "input_faces" } = points;
+    const rows = { resolution: wireResolution(resolution) };
     let shape = [values.length];
     if (values instanceof Float32Array) {
-      const n = (await this.shape(from)).nPolygons;
+      const { nPolygons, report } = await this.shape(from);
+      if (report === undefined) throw new BadReply("the report of a shape is missing");
+      const n = { input: report.nVertices, input_faces: nPolygons, proxy: report.nProxyVertices }[resolution];
       if (values.length === 0 || values.length % n !== 0) {
-        throw new CosegError(`${values.length} values are not as many for each of the ${n} faces of ${from}`);
+        const what = { input: "vertices", input_faces: "faces", proxy: "vertices of the working mesh" }[resolution];
+        throw new CosegError(`${values.length} values are not as many for each of the ${n} ${what} of ${from}`);
       }
       shape = [n, values.length / n];
     }
     const array = writer.array(values, ...shape);
-    const request = { collection: this.name, from, to, values: array, points: pointOptions(points) };
+    const wish = { values: array, points: pointOptions(points, resolution), ...rows };
+    const request = { collection: this.name, from, to, ...wish };
     const [reply, raw] = await this.library.call("transferFunction", request, { frames: writer.frames });
+    // A daemon that is too old takes landmarks for vertices of the working meshes.
+    const isBare = wish.points.landmarks.length === 0;
+    checkResolution(reply.resolution, resolution, isBare ? "input_faces" : "nothing");
     const type = values.constructor as new (buffer: ArrayBuffer) => T;
     return { values: raw.array(type, reply.values).data, quality: mapQuality(reply.quality) };
   }

@@ -2,10 +2,10 @@
 
 import { create } from "@bufbuild/protobuf";
 import { BadReply, CosegError, refused } from "./errors.js";
-import { MapOrientation, type GetFunctionalMapReply, type MapQuality as WireMapQuality } from "./gen/coseg/v1/analysis_pb.js";
+import { MapOrientation, Resolution as WireResolution, type GetFunctionalMapReply, type MapQuality as WireMapQuality } from "./gen/coseg/v1/analysis_pb.js";
 import { CollectionSpecSchema, Operator, Up, type CollectionSpec, type LabelInfo } from "./gen/coseg/v1/collection_pb.js";
 import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/coseg/v1/job_pb.js";
-import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Settings } from "./types.js";
+import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Resolution, Settings } from "./types.js";
 import { plain, type Raw } from "./wire.js";
 
 /** Maximum number of part kinds of a collection. */
@@ -35,13 +35,51 @@ export function present(label: LabelInfo | undefined): Label {
   return plain(label);
 }
 
-export function pointOptions({ landmarks = [], orientation, k = 0, alternative = false }: Points) {
+/** What rows are of, in words. */
+const ROWS: Readonly<Record<Resolution, string>> = {
+  input: "vertex of the mesh as sent",
+  input_faces: "face of the mesh as sent",
+  proxy: "vertex of the working mesh",
+};
+
+export function wireResolution(resolution: Resolution): WireResolution {
+  const names = { input: WireResolution.INPUT, input_faces: WireResolution.INPUT_FACES, proxy: WireResolution.PROXY };
+  const found = names[resolution] as WireResolution | undefined;
+  if (found === undefined) {
+    throw new CosegError(`resolution is ${resolution}, but must be one of: ${Object.keys(names).join(", ")}`);
+  }
+  return found;
+}
+
+/**
+ * Refuses arrays with other rows than requested. Daemons that know no resolution send the rows that
+ * `unset` names, which are accepted if they were requested.
+ */
+export function checkResolution(
+  found: WireResolution,
+  wanted: Resolution,
+  unset: Resolution | "nothing" = "proxy",
+): void {
+  if (found === wireResolution(wanted)) return;
+  if (found === WireResolution.UNSPECIFIED && wanted === unset) return;
+  throw new BadReply(
+    `a row for each ${ROWS[wanted]} was requested, but the daemon answers otherwise: it is too old for ` +
+      'that; the resolution "proxy" is that of the working mesh',
+  );
+}
+
+export function pointOptions(
+  { landmarks = [], orientation, k = 0, alternative = false }: Points,
+  resolution: Resolution,
+) {
   const wanted = { keep: MapOrientation.KEEP, reverse: MapOrientation.REVERSE };
   return {
     landmarks: landmarks.map(([from, to]) => ({ from, to })),
     orientation: orientation === undefined ? MapOrientation.UNSPECIFIED : wanted[orientation],
     k,
     alternative,
+    landmarkResolution:
+      landmarks.length === 0 ? WireResolution.UNSPECIFIED : wireResolution(resolution === "proxy" ? "proxy" : "input"),
   };
 }
 
@@ -50,7 +88,13 @@ export function mapQuality(quality: WireMapQuality | undefined): MapQuality {
   return plain(quality);
 }
 
-export function functionalMap(from: string, to: string, reply: GetFunctionalMapReply, raw: Raw): FunctionalMap {
+export function functionalMap(
+  from: string,
+  to: string,
+  resolution: Resolution,
+  reply: GetFunctionalMapReply,
+  raw: Raw,
+): FunctionalMap {
   const one = (c12: typeof reply.c12, p2p21: typeof reply.p2p21, quality: typeof reply.quality, matched: typeof reply.matched) => ({
     from,
     to,
@@ -59,6 +103,7 @@ export function functionalMap(from: string, to: string, reply: GetFunctionalMapR
     quality: mapQuality(quality),
     matched: raw.array(Uint32Array, matched).data,
     n1: reply.n1,
+    resolution,
   });
   return {
     ...one(reply.c12, reply.p2p21, reply.quality, reply.matched),

@@ -96,13 +96,19 @@ export interface Added {
   readonly stages: Readonly<Record<string, number>>;
 }
 
-/** Eigenpairs on a shape's working mesh, scaled to area 1. */
+/**
+ * What the rows of an array are of: vertices of the mesh as sent, its faces, or vertices of the
+ * working mesh.
+ */
+export type Resolution = "input" | "input_faces" | "proxy";
+
+/** Eigenpairs on a shape's working mesh, scaled to area 1; rows as requested. */
 export interface Spectrum {
   /** (k), ascending, 0 included. In input units: divide by `area`. */
   readonly eigenvalues: Float64Array;
-  /** (n, b) the first b ≤ k eigenvectors as columns, mass-orthonormal. */
+  /** (n, b) the first b ≤ k eigenvectors as columns, mass-orthonormal on the working mesh. */
   readonly eigenvectors?: Matrix<Float32Array>;
-  /** (n) lumped mass of each vertex. */
+  /** (n) lumped mass of each row. */
   readonly mass?: Float32Array;
   readonly area: number;
 }
@@ -127,10 +133,10 @@ export interface FunctionalMap {
   readonly to: string;
   /** (k2, k1) coefficients on shape 1 to coefficients on shape 2. */
   readonly c12: Matrix<Float32Array>;
-  /** (n2) for each vertex of shape 2's working mesh one of shape 1's. */
+  /** (n2) for each vertex of shape 2 one of shape 1; `resolution` says of what. */
   readonly p2p21: Uint32Array;
   readonly quality: MapQuality;
-  /** (n2) 1 for each vertex of shape 2's working mesh that has a counterpart on shape 1, else 0. */
+  /** (n2) 1 for each vertex of shape 2 that has a counterpart on shape 1, else 0. */
   readonly matched: Uint32Array;
   /**
    * For part maps: (n2) probability that a label transferred there is right; 0 without counterpart.
@@ -148,13 +154,18 @@ export interface FunctionalMap {
    * right.
    */
   readonly alternativeCost?: number;
-  /** Number of vertices of shape 1's working mesh; 0 if the daemon is too old to set it. */
+  /** Number of vertices (or faces) of shape 1; 0 if the daemon is too old to set it. */
   readonly n1: number;
+  /** What `p2p21` is of. */
+  readonly resolution: Resolution;
 }
 
 /** Options of a map between points. */
 export interface Points {
-  /** Corresponding vertices of the working meshes, `from` first. */
+  /**
+   * Corresponding vertices, `from` first: of the meshes as sent, or of the working meshes if the
+   * resolution is "proxy".
+   */
   readonly landmarks?: readonly (readonly [number, number])[];
   /**
    * The orientation of a map between shapes that have a reflection; by default the map keeps
@@ -167,15 +178,20 @@ export interface Points {
   readonly alternative?: boolean;
 }
 
+/** What the rows are of. */
+export interface Rows {
+  readonly resolution?: Resolution;
+}
+
 /**
  * Options for a map between points, or for the part map with its agreement with the other stored
- * maps.
+ * maps. A resolution alone is for the part map.
  */
-export type MapOptions = Points | { readonly agreement: boolean };
+export type MapOptions = (Points | { readonly agreement: boolean }) & Rows;
 
-/** Values transferred from the faces of one shape to those of another. */
+/** Values transferred from the faces or vertices of one shape to those of another. */
 export interface Transferred<T> {
-  /** One row for each face of `to`; −1 or NaN without counterpart. */
+  /** One row for each face or vertex of `to`; −1 or NaN without counterpart. */
   readonly values: T;
   /** Quality of the map that transferred them. */
   readonly quality: MapQuality;

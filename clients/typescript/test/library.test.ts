@@ -79,14 +79,15 @@ test("shapes tell what they are", async () => {
 
 test("spectra and maps are arrays", async () => {
   const [a, b] = names as [string, string];
-  const spectrum = await chairs.spectrum(a, { eigenvectors: true });
+  const spectrum = await chairs.spectrum(a, { eigenvectors: true, resolution: "proxy" });
   assert.ok(spectrum.eigenvalues.every((v, i, all) => i === 0 || v >= all[i - 1]!));
   const [n] = spectrum.eigenvectors!.shape;
   assert.equal(spectrum.mass!.length, n);
-  assert.equal((await chairs.hks(a)).shape[0], n);
+  assert.equal((await chairs.hks(a, { resolution: "proxy" })).shape[0], n);
   const proxy = await chairs.descriptors(a);
   assert.deepEqual(proxy.vertices.shape, [n, 3]);
-  const map = await lib.map(a, b, "chairs");
+  const map = await lib.map(a, b, "chairs", { resolution: "proxy" });
+  assert.deepEqual([map.n1, map.resolution, map.quality.expectedError], [n, "proxy", undefined]);
   assert.equal(map.c12.data.length, map.c12.shape[0]! * map.c12.shape[1]!);
   assert.ok(map.p2p21.every((v) => v < n!));
   assert.ok(map.quality.coverage > 0);
@@ -105,6 +106,45 @@ test("spectra and maps are arrays", async () => {
   assert.equal((await chairs.nearest(a, 2)).length, 2);
   const maps = await Promise.all(names.slice(1, 4).map((to) => chairs.map(a, to)));
   assert.deepEqual(maps.map((m) => m.to), names.slice(1, 4));
+});
+
+test("arrays are of the mesh as sent", async () => {
+  const [a, b] = names as [string, string];
+  // Its working meshes are coarser than the files.
+  const chairs = lib.collection("coarse", { parts: 4, up: "+y", workingFaces: 500 });
+  for await (const { ok } of chairs.addMany(meshes.slice(0, 2))) assert.ok(ok);
+  const [one, two] = [await chairs.shape(a), await chairs.shape(b)];
+  const [n, n2] = [one.report!.nVertices, two.report!.nVertices];
+  assert.notEqual(n, one.report!.nProxyVertices);
+  const spectrum = await chairs.spectrum(a, { eigenvectors: true });
+  assert.equal(spectrum.eigenvectors!.shape[0], n);
+  assert.ok(Math.abs(spectrum.mass!.reduce((sum, m) => sum + m, 0) - 1) < 1e-4);
+  assert.equal((await chairs.hks(a)).shape[0], n);
+  assert.equal((await chairs.hks(a, { resolution: "input_faces" })).shape[0], one.nPolygons);
+  const map = await chairs.map(a, b);
+  assert.deepEqual([map.n1, map.p2p21.length, map.resolution], [n, n2, "input"]);
+  assert.ok(map.p2p21.every((v) => v < n));
+  const faces = await chairs.map(a, b, { resolution: "input_faces" });
+  assert.deepEqual([faces.n1, faces.p2p21.length, faces.quality.expectedError], [one.nPolygons, two.nPolygons, undefined]);
+  // A constant stays one at every vertex that has a counterpart.
+  const ones = await chairs.transfer(new Float32Array(2 * n).fill(1), a, b, { resolution: "input" });
+  assert.equal(ones.length, 2 * n2);
+  assert.ok(ones.every((v) => Number.isNaN(v) || Math.abs(v - 1) < 1e-5) && ones.some((v) => v > 0));
+  const ids = await chairs.transfer(Int32Array.from({ length: n }, (_, i) => i), a, b, { resolution: "input" });
+  assert.ok(ids.length === n2 && ids.every((v) => v >= -1 && v < n));
+  // Landmarks are vertices of the files; what has the wrong length is refused with both.
+  assert.ok((await chairs.map(a, b, { landmarks: [[n - 1, n2 - 1]] })).quality.expectedError! > 0);
+  await assert.rejects(chairs.map(a, b, { landmarks: [[n, 0]] }), new RegExp(`vertex ${n}, .* has ${n} vertices`));
+  const short = new Int32Array(n - 1);
+  await assert.rejects(
+    chairs.transfer(short, a, b, { resolution: "input" }),
+    new RegExp(`${n - 1} rows, .* has ${n} vertices`),
+  );
+  await assert.rejects(
+    chairs.transfer(new Float32Array(n - 1), a, b, { resolution: "input" }),
+    new RegExp(`${n - 1} values .* ${n} vertices`),
+  );
+  await assert.rejects(chairs.hks(a, { resolution: "output" as "input" }), /resolution is output/);
 });
 
 test("refusals are typed", async () => {

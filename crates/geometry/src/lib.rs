@@ -17,6 +17,7 @@ pub mod descriptors;
 pub mod segmentation;
 pub mod describe;
 pub mod fmap;
+pub mod sites;
 pub mod spectral_mesh;
 
 pub use spectral_mesh::{SpectralMesh, SpectralMeshError};

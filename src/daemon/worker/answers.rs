@@ -1,5 +1,6 @@
 //! Computes answers from shapes and makes edits, with an open library.
 
+use super::resolution;
 use crate::Library;
 use crate::daemon::answer::{Answer, page_size, refused};
 use crate::daemon::operation::{Compute, Edit};
@@ -17,36 +18,16 @@ const DEFAULT_NEIGHBORS: u32 = 5;
 pub(super) fn compute(library: &Library, compute: Compute, sent: &[Bytes]) -> Answer {
     let mut frames = FrameWriter::default();
     let result = match compute {
-        Compute::GetFunctionalMap(r) => match &r.points {
-            Some(points) => {
-                let options = convert::point_request(points);
-                let maps = library
-                    .point_maps(&r.collection, &r.from, &r.to, &options)
-                    .map_err(refused)?;
-                let n1 = library.n_proxy_vertices(&r.collection, &r.from);
-                let reply = convert::point_maps(&maps, &mut frames);
-                Reply::GetFunctionalMap(convert::from_vertices(reply, n1.map_err(refused)?))
-            }
-            None => {
-                let map = library
-                    .map(&r.collection, &r.from, &r.to)
-                    .map_err(refused)?;
-                let mut reply = convert::functional_map(&map, &mut frames);
-                if r.agreement {
-                    let standing = library.standing(&r.collection, &r.from, &r.to, &map);
-                    reply.agreement = standing.map_err(refused)?.map(convert::agreement);
-                }
-                let n1 = library.n_proxy_vertices(&r.collection, &r.from);
-                Reply::GetFunctionalMap(convert::from_vertices(reply, n1.map_err(refused)?))
-            }
-        },
+        Compute::GetSpectrum(r) => {
+            Reply::GetSpectrum(resolution::spectrum(library, &r, &mut frames)?)
+        }
+        Compute::GetHks(r) => Reply::GetHks(resolution::hks(library, &r, &mut frames)?),
+        Compute::GetFunctionalMap(r) => {
+            Reply::GetFunctionalMap(resolution::functional_map(library, &r, &mut frames)?)
+        }
         Compute::TransferFunction(r) => {
             let values = convert::polygon_values(r.values.as_ref(), FrameReader::new(sent))?;
-            let options = convert::point_request(&r.points.clone().unwrap_or_default());
-            let (carried, map) = library
-                .transfer(&r.collection, &r.from, &r.to, &values, &options)
-                .map_err(refused)?;
-            Reply::TransferFunction(convert::transferred(&carried, &map, &mut frames))
+            Reply::TransferFunction(resolution::transfer(library, &r, &values, &mut frames)?)
         }
         Compute::GetPartCorrespondence(r) => {
             let (matches, quality) = library

@@ -17,6 +17,7 @@ mod poison;
 pub(in crate::daemon) mod pool;
 mod process;
 mod report;
+mod resolution;
 
 pub use inside::run_worker;
 pub use pipe::WORKER_COMMAND;

@@ -22,6 +22,8 @@ const POISON_BYTES: usize = 256;
 /// The shapes that remote work names, in whose meshes poison is looked for.
 pub(super) fn named_shapes(work: &Remote) -> Vec<&str> {
     match work {
+        Remote::Compute(Compute::GetSpectrum(r)) => vec![&r.shape],
+        Remote::Compute(Compute::GetHks(r)) => vec![&r.shape],
         Remote::Compute(Compute::GetFunctionalMap(r)) => vec![&r.from, &r.to],
         Remote::Compute(Compute::TransferFunction(r)) => vec![&r.from, &r.to],
         Remote::Compute(Compute::GetPartCorrespondence(r)) => vec![&r.shape_a, &r.shape_b],

@@ -5,7 +5,7 @@ use crate::fmap::consistency::Standing;
 use crate::fmap::{PointMap, Quality, Side};
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::wire::{self, ErrorReason};
-use crate::library::{MapInfo, PartMatch, PointRequest, PolygonValues};
+use crate::library::{InputShape, MapInfo, PartMatch, PointRequest, PolygonValues, Resolution};
 use crate::pipeline::DescriptionView;
 
 /// Eigenvalues, optionally with eigenvectors and mass; `area` is in squared input units.
@@ -22,6 +22,7 @@ pub fn spectrum(
             .then(|| frames.f32_array(d.eigenvectors, &[n, d.n_eigenvectors])),
         mass: eigenvectors.then(|| frames.f32_array(d.mass, &[n])),
         area,
+        resolution: wire::Resolution::Proxy.into(),
     }
 }
 
@@ -30,6 +31,58 @@ pub fn hks(d: &DescriptionView<'_>, frames: &mut FrameWriter) -> wire::GetHksRep
     let n = d.vertices.len();
     wire::GetHksReply {
         hks: Some(frames.f32_array(d.hks, &[n, d.hks.len() / n.max(1)])),
+        resolution: wire::Resolution::Proxy.into(),
+    }
+}
+
+/// Eigenvalues, with eigenvectors and mass at a resolution; `area` is in squared input units.
+pub fn spectrum_at(
+    shape: &InputShape,
+    area: f64,
+    resolution: Resolution,
+    frames: &mut FrameWriter,
+) -> wire::GetSpectrumReply {
+    let (d, n) = (shape.view(), shape.n_rows(resolution));
+    let eigenvectors = shape.interpolate(d.eigenvectors, d.n_eigenvectors, resolution);
+    wire::GetSpectrumReply {
+        eigenvalues: Some(frames.f64_array(d.eigenvalues, &[d.eigenvalues.len()])),
+        eigenvectors: Some(frames.f32_array(&eigenvectors, &[n, d.n_eigenvectors])),
+        mass: Some(frames.f32_array(shape.mass(resolution), &[n])),
+        area,
+        resolution: resolution_to_wire(resolution).into(),
+    }
+}
+
+/// The heat kernel signature at a resolution.
+pub fn hks_at(
+    shape: &InputShape,
+    resolution: Resolution,
+    frames: &mut FrameWriter,
+) -> wire::GetHksReply {
+    let d = shape.view();
+    let n_times = d.hks.len() / d.vertices.len().max(1);
+    let hks = shape.interpolate(d.hks, n_times, resolution);
+    wire::GetHksReply {
+        hks: Some(frames.f32_array(&hks, &[shape.n_rows(resolution), n_times])),
+        resolution: resolution_to_wire(resolution).into(),
+    }
+}
+
+/// The rows that a request wants; without a resolution `default`.
+pub fn resolution(wanted: wire::Resolution, default: Resolution) -> Resolution {
+    match wanted {
+        wire::Resolution::Unspecified => default,
+        wire::Resolution::Proxy => Resolution::Proxy,
+        wire::Resolution::Input => Resolution::Vertices,
+        wire::Resolution::InputFaces => Resolution::Polygons,
+    }
+}
+
+fn resolution_to_wire(resolution: Resolution) -> wire::Resolution {
+    match resolution {
+        Resolution::Proxy => wire::Resolution::Proxy,
+        Resolution::Vertices => wire::Resolution::Input,
+        Resolution::Polygons => wire::Resolution::InputFaces,
     }
 }
 
@@ -146,6 +199,7 @@ pub fn polygon_values(
 pub fn transferred(
     values: &PolygonValues,
     map: &PointMap,
+    resolution: Resolution,
     frames: &mut FrameWriter,
 ) -> wire::TransferFunctionReply {
     let values = match values {
@@ -156,6 +210,7 @@ pub fn transferred(
     wire::TransferFunctionReply {
         values: Some(values),
         quality: Some(point_quality(map)),
+        resolution: resolution_to_wire(resolution).into(),
     }
 }
 
@@ -174,10 +229,17 @@ pub fn functional_map(map: &MapInfo, frames: &mut FrameWriter) -> wire::GetFunct
     }
 }
 
-/// Adds the number of vertices of the source shape's proxy to a map.
-pub fn from_vertices(map: wire::GetFunctionalMapReply, n1: usize) -> wire::GetFunctionalMapReply {
-    let n1 = u32::try_from(n1).unwrap_or(u32::MAX);
-    wire::GetFunctionalMapReply { n1, ..map }
+/// Adds to a map the number of rows of the source shape at the map's resolution.
+pub fn from_rows(
+    map: wire::GetFunctionalMapReply,
+    n1: usize,
+    resolution: Resolution,
+) -> wire::GetFunctionalMapReply {
+    wire::GetFunctionalMapReply {
+        n1: u32::try_from(n1).unwrap_or(u32::MAX),
+        resolution: resolution_to_wire(resolution).into(),
+        ..map
+    }
 }
 
 /// The agreement of a map with the others of its collection.

@@ -72,7 +72,21 @@ pub fn check_map(
     r: &wire::GetFunctionalMapRequest,
     _frames: &mut NamedFrames,
 ) -> Result<(), wire::Error> {
+    known::<wire::Resolution>(r.resolution, "resolution")?;
     check_points(r.points.as_ref())
+}
+
+/// Checks a request for a spectrum.
+pub fn check_spectrum(
+    r: &wire::GetSpectrumRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::Resolution>(r.resolution, "resolution")
+}
+
+/// Checks a request for a heat kernel signature.
+pub fn check_hks(r: &wire::GetHksRequest, _frames: &mut NamedFrames) -> Result<(), wire::Error> {
+    known::<wire::Resolution>(r.resolution, "resolution")
 }
 
 /// Checks a transfer of values.
@@ -80,6 +94,7 @@ pub fn check_transfer(
     r: &wire::TransferFunctionRequest,
     frames: &mut NamedFrames,
 ) -> Result<(), wire::Error> {
+    known::<wire::Resolution>(r.resolution, "resolution")?;
     check_points(r.points.as_ref())?;
     frames.array(r.values.as_ref());
     Ok(())
@@ -145,6 +160,15 @@ fn check_spec(spec: Option<&wire::CollectionSpec>, field: &str) -> Result<(), wi
 fn check_points(points: Option<&wire::PointMapOptions>) -> Result<(), wire::Error> {
     let Some(points) = points else { return Ok(()) };
     known::<wire::MapOrientation>(points.orientation, "points.orientation")?;
+    let field = "points.landmark_resolution";
+    known::<wire::Resolution>(points.landmark_resolution, field)?;
+    if points.landmark_resolution() == wire::Resolution::InputFaces {
+        let text = format!(
+            "{field} is RESOLUTION_INPUT_FACES, but landmarks are vertices: RESOLUTION_INPUT or \
+             RESOLUTION_PROXY"
+        );
+        return Err(field_error(ErrorReason::FieldRange, field, text));
+    }
     at_most("points.landmarks", points.landmarks.len(), MAX_LANDMARKS)
 }
 
@@ -189,7 +213,8 @@ impl NamedFrames {
 #[cfg(test)]
 mod tests {
     use super::{
-        NamedFrames, check_addition, check_creation, check_map, check_portraits, check_transfer,
+        NamedFrames, check_addition, check_creation, check_hks, check_map, check_portraits,
+        check_spectrum, check_transfer,
     };
     use crate::ipc::wire::{self, ErrorReason, error::Subject, shape_input::Source};
 
@@ -293,6 +318,44 @@ mod tests {
             };
             checked(check_transfer, &request, 0)
         };
+        let rows = |resolution| {
+            let points = |landmark_resolution| wire::PointMapOptions {
+                landmark_resolution,
+                ..Default::default()
+            };
+            let hks = wire::GetHksRequest {
+                resolution,
+                ..Default::default()
+            };
+            let spectrum = wire::GetSpectrumRequest {
+                resolution,
+                ..Default::default()
+            };
+            let transfer = wire::TransferFunctionRequest {
+                resolution,
+                ..Default::default()
+            };
+            let map = wire::GetFunctionalMapRequest {
+                resolution,
+                ..Default::default()
+            };
+            let landmarks = wire::GetFunctionalMapRequest {
+                points: Some(points(resolution)),
+                ..Default::default()
+            };
+            [
+                checked(check_hks, &hks, 0),
+                checked(check_spectrum, &spectrum, 0),
+                checked(check_transfer, &transfer, 0),
+                checked(check_map, &map, 0),
+                checked(check_map, &landmarks, 0),
+            ]
+        };
+        let (known, faces) = (rows(2), rows(3));
+        assert!(known.iter().all(Result::is_ok), "{known:?}");
+        assert!(rows(4).iter().all(Result::is_err));
+        // Landmarks are no faces.
+        assert!(faces[..4].iter().all(Result::is_ok) && faces[4].is_err());
         let portraits = |detail, n| {
             let request = wire::GetPortraitsRequest {
                 detail,

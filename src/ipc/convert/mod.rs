@@ -11,12 +11,13 @@ mod questions;
 mod shapes;
 
 pub use analysis::{
-    agreement, descriptors, from_vertices, functional_map, hks, nearest, part_correspondence,
-    point_maps, point_request, polygon_values, spectrum, transferred,
+    agreement, descriptors, from_rows, functional_map, hks, hks_at, nearest, part_correspondence,
+    point_maps, point_request, polygon_values, resolution, spectrum, spectrum_at, transferred,
 };
 pub use checked::{
     MAX_LANDMARKS, MAX_PORTRAITS, NamedFrames, check_addition, check_correction, check_creation,
-    check_map, check_portraits, check_review, check_reviews, check_transfer, check_update,
+    check_hks, check_map, check_portraits, check_review, check_reviews, check_spectrum,
+    check_transfer, check_update,
 };
 pub use collections::{
     collection, collection_differs, collection_spec, label_info, new_up, parse_up, up_from_wire,

@@ -56,6 +56,7 @@ fn shapes_are_labelled_in_the_order_of_their_faces() {
         collection,
         shape,
         eigenvectors: true,
+        ..Default::default()
     };
     let (spectrum, frames) = call!(client, GetSpectrum(request), frames).unwrap();
     let reader = FrameReader::new(&frames);

@@ -441,14 +441,26 @@ class AsyncCollection:
 
     # -- analysis -------------------------------------------------------------------------------
 
-    async def spectrum(self, name: str, *, eigenvectors: bool = False) -> t.Spectrum:
-        """Eigenvalues and, if wanted, eigenvectors and mass."""
-        reply, raw = await self._call("get_spectrum", shape=name, eigenvectors=eigenvectors)
+    async def spectrum(
+        self, name: str, *, eigenvectors: bool = False, resolution: t.Resolution = "input"
+    ) -> t.Spectrum:
+        """Eigenvalues and, if wanted, eigenvectors and mass: a row for each vertex of the mesh as it was
+        sent. ``resolution`` is ``"input"``, ``"input_faces"`` (a row for each of its faces) or ``"proxy"``
+        (for each vertex of the working mesh, where the eigenvectors are orthonormal; the others are
+        interpolated, and NaN at vertices without a face)."""
+        wanted = wire.resolution(resolution)
+        reply, raw = await self._call(
+            "get_spectrum", shape=name, eigenvectors=eigenvectors, resolution=wanted
+        )
+        if eigenvectors:
+            wire.check_resolution(reply.resolution, resolution)
         return wire.spectrum(reply, raw)
 
-    async def hks(self, name: str) -> t.Float32:
-        """(n, t) heat kernel signature: a row for each vertex of the working mesh."""
-        reply, raw = await self._call("get_hks", shape=name)
+    async def hks(self, name: str, *, resolution: t.Resolution = "input") -> t.Float32:
+        """(n, t) heat kernel signature: a row for each vertex of the mesh as it was sent, or as
+        ``resolution`` says: see :meth:`spectrum`."""
+        reply, raw = await self._call("get_hks", shape=name, resolution=wire.resolution(resolution))
+        wire.check_resolution(reply.resolution, resolution)
         hks: t.Float32 = raw.array(reply.hks)
         return hks
 
@@ -468,25 +480,29 @@ class AsyncCollection:
         orientation: str | None = None,
         k: int = 0,
         alternative: bool = False,
+        resolution: t.Resolution = "input",
     ) -> t.FunctionalMap:
         """The functional map that carries functions on ``source`` to functions on ``target``, and the
-        pointwise map, which goes the other way.
+        pointwise map, which goes the other way: from the vertices of one mesh as it was sent to those of
+        the other, or as ``resolution`` says (see :meth:`spectrum`). ``c_12`` is the same at each.
 
         By default it is the map by which labels are carried, which is kept; ``agreement`` says how it
         agrees with the other kept maps. With ``points``, or any option after it, it is made for points,
         now, in about 0.1 s, and its quality has the error to expect; ``landmarks`` are pairs of vertices
-        of the working meshes that correspond, ``orientation`` is ``"keep"`` or ``"reverse"`` (without:
+        that correspond, of the meshes as they were sent (with ``resolution="proxy"`` of the working
+        meshes), ``orientation`` is ``"keep"`` or ``"reverse"`` (without:
         the one that keeps it, unless that is much worse), ``k`` the size of ``c_12`` (without: 100), and
         ``alternative`` asks for the best map of the other orientation too.
         """
         # `from` is a word of the language.
-        fields: dict[str, Any] = {"from": source, "to": target}
-        asked = _point_options(landmarks, orientation, k, alternative)
+        fields: dict[str, Any] = {"from": source, "to": target, "resolution": wire.resolution(resolution)}
+        asked = _point_options(landmarks, orientation, k, alternative, resolution)
         if points or asked:
             fields["points"] = asked
         if agreement:
             fields["agreement"] = True
         reply, raw = await self._call("get_functional_map", **fields)
+        wire.check_resolution(reply.resolution, resolution)
         return wire.functional_map(source, target, reply, raw)
 
     async def transfer(
@@ -498,10 +514,15 @@ class AsyncCollection:
         landmarks: Iterable[tuple[int, int]] = (),
         orientation: str | None = None,
         k: int = 0,
+        resolution: t.Resolution = "input_faces",
     ) -> np.ndarray[Any, Any]:
         """Carries values at the faces of ``source`` to those of ``target``, by a map between points:
-        integers ``(n,)`` are voted on, numbers ``(n, …)`` averaged. Options are those of :meth:`map`."""
+        integers ``(n,)`` are voted on, numbers ``(n, …)`` averaged. With ``resolution="input"`` values are
+        at the vertices of the meshes as they were sent: integers are those of the vertex that corresponds,
+        numbers are interpolated; with ``"proxy"`` at those of the working meshes. Other options are those
+        of :meth:`map`."""
         options: dict[str, Any] = {"landmarks": landmarks, "orientation": orientation, "k": k}
+        options["resolution"] = resolution
         return (await self.transferred(values, source, target, **options)).values
 
     async def transferred(
@@ -513,20 +534,28 @@ class AsyncCollection:
         landmarks: Iterable[tuple[int, int]] = (),
         orientation: str | None = None,
         k: int = 0,
+        resolution: t.Resolution = "input_faces",
     ) -> t.Transferred:
         """What :meth:`transfer` gives, with the quality of the map."""
+        rows = wire.resolution(resolution)
         array, writer = np.asarray(values), FrameWriter()
         if array.ndim == 0 or array.size == 0 or array.dtype.kind not in "biuf":
             raise ValueError(
-                f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each face"
+                f"values are {array.dtype}{array.shape}, expected numbers (n, …), a row for each"
+                f" {t.ROWS[resolution]}"
             )
         if array.dtype.kind in "iu":
             ref = writer.array(_integers(array, np.int32, "values"))
         else:
             ref = writer.array(array.astype(np.float32).reshape(len(array), -1))
         fields: dict[str, Any] = {"from": source, "to": target, "values": ref}
-        fields["points"] = _point_options(landmarks, orientation, k, False)
+        fields["points"] = asked = _point_options(landmarks, orientation, k, False, resolution)
+        fields["resolution"] = rows
         reply, raw = await self._call("transfer_function", writer.frames, **fields)
+        # A daemon that is too old takes landmarks for vertices of the working meshes.
+        wire.check_resolution(
+            reply.resolution, resolution, unset=None if "landmarks" in asked else "input_faces"
+        )
         carried: np.ndarray[Any, Any] = raw.array(reply.values)
         return t.Transferred(carried.reshape(-1, *array.shape[1:]), wire.map_quality(reply.quality))
 
@@ -734,7 +763,11 @@ class AsyncCollection:
 
 
 def _point_options(
-    landmarks: Iterable[tuple[int, int]], orientation: str | None, k: int, alternative: bool
+    landmarks: Iterable[tuple[int, int]],
+    orientation: str | None,
+    k: int,
+    alternative: bool,
+    resolution: t.Resolution,
 ) -> dict[str, Any]:
     """What is asked of a map between points; nothing if all is as usual."""
     pairs = [{"from": int(source), "to": int(target)} for source, target in landmarks]
@@ -743,6 +776,8 @@ def _point_options(
         "orientation": wire.orientation(orientation),
         "k": k,
         "alternative": alternative,
+        # Of the working meshes where everything else is, too; else of the meshes as they were sent.
+        "landmark_resolution": wire.resolution("proxy" if resolution == "proxy" else "input") if pairs else 0,
     }
     return {name: value for name, value in asked.items() if value}
 

@@ -385,6 +385,7 @@ def functional_map(
 ) -> t.FunctionalMap:
     """A functional map."""
     alternative = None
+    rows = resolution_name(reply.resolution)
     if reply.HasField("alternative_c_12"):
         alternative = t.FunctionalMap(
             source,
@@ -394,6 +395,7 @@ def functional_map(
             map_quality(reply.alternative_quality),
             raw.array(reply.alternative_matched) != 0,
             n1=reply.n1,
+            resolution=rows,
         )
     return t.FunctionalMap(
         source,
@@ -407,7 +409,32 @@ def functional_map(
         alternative=alternative,
         alternative_cost=reply.alternative_cost if reply.HasField("alternative_cost") else None,
         n1=reply.n1,
+        resolution=rows,
     )
+
+
+def resolution(name: t.Resolution) -> int:
+    """What the rows of arrays are of: ``input``, ``input_faces`` or ``proxy``."""
+    key = f"RESOLUTION_{name.upper()}"
+    return int(_value(analysis_pb2.Resolution, key, f"resolution is {name!r}"))
+
+
+def resolution_name(value: int) -> t.Resolution:
+    """Its name; the daemons that know none have rows of the proxy."""
+    names: tuple[t.Resolution, ...] = ("proxy", "proxy", "input", "input_faces")
+    if not 0 <= value < len(names):
+        raise BadReply(f"the reply has resolution {value}, which this client does not know")
+    return names[value]
+
+
+def check_resolution(found: int, wanted: t.Resolution, unset: t.Resolution | None = "proxy") -> None:
+    """Refuses arrays with other rows than were asked for. Daemons that know no resolution send what
+    ``unset`` says, which is taken where that was asked for."""
+    if found != resolution(wanted) and not (found == 0 and wanted == unset):
+        raise BadReply(
+            f"a row for each {t.ROWS[wanted]} was asked for, and the daemon answers otherwise: it is too "
+            'old for that; resolution="proxy" asks for the working mesh'
+        )
 
 
 def orientation(name: str | None) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,16 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Element = TypeVar("Element", bound=np.generic)
+
+#: What the rows of an array are of: vertices of the mesh as it was sent, its faces, or vertices of the
+#: working mesh.
+Resolution = Literal["input", "input_faces", "proxy"]
+#: The same in words.
+ROWS: Mapping[str, str] = {
+    "input": "vertex of the mesh as it was sent",
+    "input_faces": "face of the mesh as it was sent",
+    "proxy": "vertex of the working mesh",
+}
 
 
 @dataclass(frozen=True)
@@ -271,13 +281,13 @@ class RetriedJob(Job):
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenpairs of W φ = λ A φ on a shape's working mesh, scaled to area 1."""
+    """Eigenpairs of W φ = λ A φ on a shape's working mesh, scaled to area 1; rows as asked for."""
 
     #: (k,) ascending, 0 included. In input units: divide by ``area``.
     eigenvalues: Float64
-    #: (n, b) the first b ≤ k eigenvectors as columns, mass-orthonormal.
+    #: (n, b) the first b ≤ k eigenvectors as columns, mass-orthonormal on the working mesh.
     eigenvectors: Float32 | None
-    #: (n,) lumped mass of each vertex; sums to 1.
+    #: (n,) lumped mass of each row; sums to 1.
     mass: Float32 | None
     #: Surface area in squared input units.
     area: float
@@ -356,10 +366,10 @@ class FunctionalMap:
     target: str
     #: (k2, k1) coefficients on shape 1 to coefficients on shape 2, in the bases of ``spectrum``.
     c_12: Float32
-    #: (n2,) for each vertex of shape 2's working mesh one of shape 1's.
+    #: (n2,) for each vertex of shape 2 one of shape 1; of what, :attr:`resolution` says.
     p2p_21: UInt32
     quality: MapQuality
-    #: (n2,) whether something of shape 1 corresponds to each vertex of shape 2's working mesh.
+    #: (n2,) whether something of shape 1 corresponds to each vertex of shape 2.
     matched: Bool
     #: Of maps for parts: (n2,) probability that a label carried there is right; 0 where nothing corresponds.
     confidence: Float32 | None = None
@@ -369,14 +379,18 @@ class FunctionalMap:
     alternative: FunctionalMap | None = None
     #: What that costs over what this one does: near 1, the shapes themselves hardly say which is meant.
     alternative_cost: float | None = None
-    #: Vertices of shape 1's working mesh: so many values :meth:`carry` takes. 0: a daemon that does not say.
+    #: Vertices (or faces) of shape 1: so many values :meth:`carry` takes. 0: a daemon that does not say.
     n1: int = 0
+    #: What ``p2p_21`` is of: ``"input"``, vertices of the meshes as they were sent, ``"input_faces"``, their
+    #: faces, or ``"proxy"``, vertices of the working meshes.
+    resolution: Resolution = "proxy"
 
     def carry(self, values: NDArray[Element]) -> NDArray[Element]:
-        """Carries values at vertices of shape 1's working mesh, (n1, …), to those of shape 2's, (n2, …).
+        """Carries values at the vertices of shape 1, (n1, …), to those of shape 2, (n2, …): of the meshes
+        that :attr:`resolution` says, or at their faces.
 
-        Raises :class:`ValueError` if there are not n1 of them: values at faces, at vertices of the
-        file, or of the other shape would be carried without a word, and mean nothing.
+        Raises :class:`ValueError` if there are not n1 of them: values at something else, or of the other
+        shape, would be carried without a word, and mean nothing.
         """
         array = np.asarray(values)
         n = len(array) if array.ndim else 0
@@ -384,8 +398,9 @@ class FunctionalMap:
         least = self.n1 or int(self.p2p_21.max()) + 1
         if n < least or (self.n1 and n != self.n1):
             raise ValueError(
-                f"values have {n} rows, but the working mesh of {self.source!r} has {least} vertices; "
-                "`hks`, `spectrum(…).eigenvectors` and `descriptors(…).vertices` have a row for each"
+                f"values have {n} rows, but {self.source!r} has {least}, one for each "
+                f"{ROWS[self.resolution]}; `hks` and `spectrum(…).eigenvectors` have as many with "
+                f"resolution={self.resolution!r}"
             )
         carried: NDArray[Element] = array[self.p2p_21]
         return carried
@@ -393,9 +408,9 @@ class FunctionalMap:
 
 @dataclass(frozen=True)
 class Transferred:
-    """Values that were carried from the faces of one shape to those of another."""
+    """Values that were carried from the faces or vertices of one shape to those of another."""
 
-    #: One row for each face of the target; −1 or NaN where nothing corresponds.
+    #: One row for each face or vertex of the target; −1 or NaN where nothing corresponds.
     values: np.ndarray[Any, Any]
     #: How good the map is that carried them.
     quality: MapQuality

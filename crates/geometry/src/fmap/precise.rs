@@ -108,7 +108,7 @@ pub fn precise(
 /// Squared distance to the nearest point of a triangle in any dimension, and its barycentric
 /// coordinates (after Ericson 2005, *Real-Time Collision Detection*, section 5.1.5, which needs dot
 /// products only).
-fn nearest_in_triangle(p: &[f32], [a, b, c]: [&[f32]; 3]) -> (f32, [f32; 3]) {
+pub(crate) fn nearest_in_triangle(p: &[f32], [a, b, c]: [&[f32]; 3]) -> (f32, [f32; 3]) {
     let (mut d1, mut d2, mut bb, mut bc, mut cc) = (0.0f64, 0.0f64, 0.0f64, 0.0f64, 0.0f64);
     for i in 0..p.len() {
         let (u, w, q) = (

@@ -32,6 +32,8 @@ pub use instances::{Instances, instances};
 pub use parse::{MAX_CORNERS, MAX_TRIANGLES, ParseError, as_utf8, parse};
 pub use polygon::{PolygonKind, Triangulator};
 pub use proxy::{Proxy, proxy};
+#[cfg(test)]
+pub(crate) use refine::refine;
 pub use shells::outer_shells;
 pub(crate) use vector::{add, cross, distance, dot, norm, scale, sub, unit};
 

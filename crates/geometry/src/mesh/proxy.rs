@@ -34,6 +34,10 @@ pub struct Proxy {
     pub mesh: TriMesh,
     /// For each face of the cleaned mesh its proxy face `(m,)`.
     pub face_map: Vec<u32>,
+    /// Where the origin of the proxy is in the cleaned mesh: `proxy = (cleaned − center) · factor`.
+    pub center: [f64; 3],
+    /// The scale between the two.
+    pub factor: f64,
 }
 
 /// A mesh of about `working_faces` faces for a cleaned one, which must have a face.
@@ -80,6 +84,8 @@ pub fn proxy(cleaned: &TriMesh, working_faces: u32) -> Proxy {
         return Proxy {
             mesh: cleaned.clone(),
             face_map: (0..n as u32).collect(),
+            center: [0.0; 3],
+            factor: 1.0,
         };
     };
     let face_map = if changed || rounded.faces.len() != n_exact {
@@ -90,6 +96,8 @@ pub fn proxy(cleaned: &TriMesh, working_faces: u32) -> Proxy {
     Proxy {
         mesh: rounded,
         face_map,
+        center,
+        factor,
     }
 }
 

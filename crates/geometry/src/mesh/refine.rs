@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BinaryHeap};
 
 /// Halves edges, longest first, while `go_on(length of the longest edge, number of faces)`. The
 /// surface does not change. O(log n) for each cut.
-pub(super) fn refine(mesh: &mut TriMesh, go_on: impl Fn(f64, usize) -> bool) {
+pub(crate) fn refine(mesh: &mut TriMesh, go_on: impl Fn(f64, usize) -> bool) {
     let mut faces_of: BTreeMap<[u32; 2], Vec<u32>> = BTreeMap::new();
     let mut queue = BinaryHeap::new();
     let key = |a: u32, b: u32| [a.min(b), a.max(b)];
