@@ -33,6 +33,7 @@ EXCEPTIONS = {
     r"cargo install cargo-deb .*|packaging/build\.sh": "tests/package/run.sh types it",
     r"pip install './clients/python\[usd\]'|coseg usd .*": "needs OpenUSD; clients/python/tests/test_usd.py types it",
     r"python3 clients/blender/build\.py .*": "fetches wheels; clients/blender/check.sh types it",
+    r"packaging/container\.sh .*": "tests/package/container.sh runs it",
     r"sudo .*": "changes this machine; tests/package/run.sh does the same in a Debian of its own",
     r"pip install \./clients/python|npm ci && .*": "clients/check.sh types it",
     r"python tests/golden/record\.py .*": "would rewrite the recorded conversations, which tests/it/golden.rs replays",

@@ -11,6 +11,10 @@ if ! command -v debootstrap >/dev/null; then
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends debootstrap >/dev/null
 fi
 step() { printf '\n== %s (%ss)\n' "$1" "$SECONDS"; }
+if ! command -v buildah >/dev/null; then
+    apt-get update -qq
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends buildah >/dev/null || true
+fi
 
 work=$(mktemp -d)
 root="$work/root"
@@ -36,6 +40,8 @@ else
         >"$work/debootstrap.log" 2>&1 || { tail "$work/debootstrap.log" >&2; exit 1; }
     [ -z "${COSEG_DEBIAN:-}" ] || cp -a "$root" "$COSEG_DEBIAN"
 fi
+# The base of the container, before anything is installed.
+! command -v buildah >/dev/null || tar -C "$root" --one-file-system -cf "$work/base.tar" .
 mount -t proc proc "$root/proc"
 in_root() { env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin DEBIAN_FRONTEND=noninteractive chroot "$root" "$@"; }
 cp "$work"/{old,new}.deb "$root/"
@@ -132,4 +138,10 @@ step "purge: nothing stays but the user"
 in_root dpkg --purge coseg >/dev/null 2>&1
 left=$(find "$root/usr" "$root/etc" "$root/var/lib" -path "$root/var/lib/dpkg" -prune -o -name '*coseg*' -print)
 [ -z "$left" ] || { echo "left: $left" >&2; exit 1; }
+if command -v buildah >/dev/null; then
+    step "a container of the package, on that Debian"
+    tests/package/container.sh "$work/new.deb" "$work/base.tar"
+else
+    echo "skipped: the container needs buildah"
+fi
 step "the package is well"
