@@ -10,9 +10,11 @@ work=$(mktemp -d)
 COSEG_BUILDER="buildah --storage-driver vfs --root $work/root --runroot $work/runroot"
 export COSEG_BUILDER BUILDAH_ISOLATION=chroot
 # shellcheck disable=SC2086 # words of their own
-buildah_() { $COSEG_BUILDER "$@"; }
+buildah_() { ${builder:-} $COSEG_BUILDER "$@"; }
 daemon=
 clean() {
+    status=$?
+    [ "$status" = 0 ] || ! [ -s "$work/log" ] || { echo "the daemon said:" >&2; cat "$work/log" >&2; }
     [ -z "$daemon" ] || kill "$daemon" 2>/dev/null || true
     [ -z "$daemon" ] || wait "$daemon" 2>/dev/null || true
     buildah_ rm --all >/dev/null 2>&1 || true
@@ -35,14 +37,28 @@ image() { python3 -c "import json,sys; c=json.load(open('$work/image.json'))['Do
 mapfile -t command < <(image '*c["Cmd"], sep="\n"')
 mapfile -t health < <(image '*c["Healthcheck"]["Test"][1:], sep="\n"')
 
+# Clients have a container of their own, and share the volumes.
 mkdir "$work/library" "$work/run"
+container() {
+    local name
+    name=$(buildah_ from --pull-never coseg)
+    # Its own volumes would cover those that are given to it.
+    buildah_ config --volume /var/lib/coseg- --volume /run/coseg- "$name"
+    echo "$name"
+}
+client=$(container)
+user=$(buildah_ run "$client" -- id -u)
+[ "$user" != 0 ]
+chown "$user" "$work/library" "$work/run"
+in_container() {
+    local container=$1
+    shift
+    buildah_ run --cap-drop all -v "$work/library:/var/lib/coseg" -v "$work/run:/run/coseg" "$container" -- "$@"
+}
 serve() {
-    container=$(buildah_ from --pull-never coseg)
-    user=$(buildah_ run "$container" -- id -u)
-    [ "$user" != 0 ]
-    chown "$user" "$work/library" "$work/run"
-    # The builder itself gets the signal and passes it on.
-    in_container "${command[@]}" >"$work/log" 2>&1 &
+    server=$(container)
+    # The builder is what is signalled, and passes the signal on.
+    (builder=exec && in_container "$server" "${command[@]}") >"$work/log" 2>&1 &
     daemon=$!
     for _ in $(seq 200); do
         ! grep -q serving "$work/log" || return 0
@@ -51,29 +67,28 @@ serve() {
     cat "$work/log" >&2
     exit 1
 }
-in_container() {
-    buildah_ run --cap-drop all -v "$work/library:/var/lib/coseg" -v "$work/run:/run/coseg" "$container" -- "$@"
-}
 stop() {
-    in_container coseg stop >"$work/stop.log" 2>&1 || { cat "$work/stop.log" >&2; exit 1; }
+    in_container "$client" coseg stop >"$work/stop.log" 2>&1 || { cat "$work/stop.log" >&2; exit 1; }
     wait "$daemon" || { cat "$work/log" >&2; exit 1; }
     daemon=
-    buildah_ rm "$container" >/dev/null
+    buildah_ rm "$server" >/dev/null
 }
 
 serve
-in_container "${health[@]}" | head -n 3
-in_container sh -ec 'coseg synth pliers --count 2 --faces 1000 --out /tmp/meshes 2>/dev/null
+in_container "$client" "${health[@]}" >"$work/health.txt"
+head -n 1 "$work/health.txt"
+in_container "$client" sh -ec 'coseg synth pliers --count 2 --faces 1000 --out /tmp/meshes 2>/dev/null
     coseg add /tmp/meshes --collection pliers --parts 3' >"$work/add.log" 2>&1 || { cat "$work/add.log" >&2; exit 1; }
-in_container coseg labels pliers-001 --collection pliers >"$work/before.txt"
+in_container "$client" coseg labels pliers-001 --collection pliers >"$work/before.txt"
 [ "$(stat -c %u "$work/library/library")" = "$user" ]
 stop
 # Without a daemon it is not healthy.
-container=$(buildah_ from --pull-never coseg)
-! in_container "${health[@]}" >/dev/null 2>&1
-buildah_ rm "$container" >/dev/null
+if in_container "$client" "${health[@]}" >/dev/null 2>&1; then
+    echo "it is healthy without a daemon" >&2
+    exit 1
+fi
 # A new container finds the library in the volume.
 serve
-in_container coseg labels pliers-001 --collection pliers | cmp - "$work/before.txt"
+in_container "$client" coseg labels pliers-001 --collection pliers | cmp - "$work/before.txt"
 stop
 echo "the container serves as user $user and keeps its library: $(wc -l <"$work/before.txt") labels"
