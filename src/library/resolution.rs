@@ -167,8 +167,8 @@ impl InputShape {
         }
     }
 
-    /// Values `(n, dim)` at the vertices of the proxy, interpolated linearly; NaN at vertices of the
-    /// file that no polygon uses.
+    /// Values `(n, dim)` at the vertices of the proxy, interpolated linearly; NaN at vertices of
+    /// the file that no polygon uses.
     pub fn interpolate(&self, values: &[f32], dim: usize, resolution: Resolution) -> Vec<f32> {
         match self.sites(resolution) {
             Some(sites) => sites.interpolate(self.view().faces, values, dim),
