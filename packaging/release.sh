@@ -44,7 +44,12 @@ cargo build --release --locked --quiet -p coseg -p coseg-python
 built=$root/target/release
 if [ -n "$glibc" ]; then
     target=x86_64-unknown-linux-gnu
-    cargo zigbuild --release --locked --quiet -p coseg -p coseg-python --target "$target.$glibc"
+    # What zig compiles of libc stays here for the next time; its temporary files are large.
+    zig=$root/target/zig
+    mkdir -p "$zig/tmp"
+    TMPDIR=$zig/tmp ZIG_GLOBAL_CACHE_DIR=$zig/cache ZIG_LOCAL_CACHE_DIR=$zig/cache \
+        CARGO_ZIGBUILD_CACHE_DIR=$zig/wrappers \
+        cargo zigbuild --release --locked --quiet -p coseg -p coseg-python --target "$target.$glibc"
     built=$root/target/$target/release
 fi
 "$built/coseg" --version
