@@ -439,7 +439,7 @@ pub(crate) struct Export {
     /// Folder for the files, created if missing
     #[arg(long, short, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Materials of parts, for glb of a glTF and obj of an OBJ
+    /// Materials of parts, for glb, obj and ply of a glTF or an OBJ
     #[arg(long, value_name = "WHICH", default_value = "own")]
     pub(crate) materials: ExportMaterials,
     /// A subset for each part, such as leg_001, in place of one for each label, for usda

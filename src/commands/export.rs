@@ -1,6 +1,6 @@
 //! `coseg export` writes labels, or coloured meshes, of a collection to files.
 
-use super::export_mesh::{colour, styles};
+use super::export_mesh::{OwnMaterials, colour, styles};
 use super::session::{Session, bar};
 use super::{CommandError, Outcome, labels};
 use crate::cli::{Export, ExportFormat, ExportMaterials};
@@ -11,8 +11,8 @@ use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
 use coseg::library::shown;
 use coseg::mesh::write::{
-    Labelling, Materials, glb, glb_of_obj, labelled_gltf, labelled_obj, mtl, npy, obj, ply, seg,
-    usda,
+    Attributes, Labelling, Materials, glb, glb_of_obj, labelled_gltf, labelled_obj, mtl, npy,
+    obj_with, ply_with, seg, usda,
 };
 use coseg::mesh::{Format, ParseError, ParsedMesh, parse};
 use coseg::store::Digest;
@@ -52,6 +52,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         written.push(path.display().to_string());
         Ok::<_, CommandError>(())
     };
+    let mut own = OwnMaterials::beside(&styles);
     let progress = bar(shapes.len() as u64);
     for shape in &shapes {
         progress.set_message(shape.clone());
@@ -72,7 +73,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         } else {
             let original = Original::receive(&mut session, &collection, shape)?;
             let mesh = original.mesh(shape, labelling.labels.len())?;
-            with_mesh(args, shape, (&original, &mesh, up), &labelling)
+            with_mesh(args, shape, (&original, &mesh, up), &labelling, &mut own)
                 .map_err(|e| bad_reply(format!("{shape}: {e}")))?
         };
         let stem = file_stem(shape, suffix);
@@ -85,7 +86,8 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         progress.inc(1);
     }
     if args.format == ExportFormat::Obj {
-        write(MATERIALS.to_owned(), mtl(&styles).as_bytes())?;
+        let text = mtl(&styles) + &own.text();
+        write(MATERIALS.to_owned(), text.as_bytes())?;
     }
     progress.finish_and_clear();
     if session.json {
@@ -150,12 +152,13 @@ fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
 }
 
 /// Suffix and bytes of a file that contains the mesh, with its up axis, and its labels. A file in
-/// the format of the original keeps what that holds.
+/// the format of the original keeps what that holds; `own` collects materials for [`MATERIALS`].
 fn with_mesh(
     args: &Export,
     shape: &str,
     (original, mesh, up): (&Original, &ParsedMesh, Option<[f64; 3]>),
     labelling: &Labelling<'_>,
+    own: &mut OwnMaterials,
 ) -> Result<(&'static str, Vec<u8>), ParseError> {
     let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
     let bytes = &original.bytes;
@@ -168,8 +171,12 @@ fn with_mesh(
             let bytes = labelled_obj(bytes, labelling, materials, MATERIALS)?;
             (".obj", bytes)
         }
-        (ExportFormat::Obj, _) => {
-            let text = obj(vertices, &polygons, labelling, MATERIALS);
+        (ExportFormat::Obj, format) => {
+            let attributes = Attributes::of(bytes, format)?;
+            let names = own.names(&attributes);
+            let own = (materials == Materials::Own).then_some(names.as_slice());
+            let of = (&attributes, own);
+            let text = obj_with(vertices, &polygons, labelling, MATERIALS, of);
             (".obj", text.into_bytes())
         }
         (ExportFormat::Glb, Format::Gltf) => {
@@ -177,7 +184,7 @@ fn with_mesh(
             (".glb", bytes)
         }
         (ExportFormat::Glb, Format::Obj) => {
-            let bytes = glb_of_obj(shape, bytes, labelling, up)?;
+            let bytes = glb_of_obj(shape, bytes, labelling, materials, up)?;
             (".glb", bytes)
         }
         (ExportFormat::Glb, _) => {
@@ -191,7 +198,9 @@ fn with_mesh(
         _ => {
             let colour = |label: &i32| colour(*label, labelling.styles);
             let colours: Vec<[u8; 3]> = labelling.labels.iter().map(colour).collect();
-            let bytes = ply(vertices, &polygons, &colours, labelling.labels);
+            let attributes = Attributes::of(bytes, original.format)?;
+            let of = (&attributes, materials);
+            let bytes = ply_with(vertices, &polygons, &colours, labelling.labels, of);
             (".ply", bytes)
         }
     })

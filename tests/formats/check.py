@@ -172,5 +172,51 @@ for node in new["nodes"]:
         assert primitive["attributes"].keys() == {"POSITION", "NORMAL", "TEXCOORD_0"}, primitive
         material = {"seat": "oak", "back": "pine"}[parents[node["name"]]["name"]]
         assert primitive["extras"]["material"] == material, primitive
+
+
+def corners_of(path):
+    """Position, texture coordinates and normal of each corner of a scene's triangles, sorted, and its materials."""
+    rows, materials = [], set()
+    scene = trimesh.load(path, process=False, maintain_order=True, force="scene")
+    for node in scene.graph.nodes_geometry:
+        matrix, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        at = trimesh.transform_points(mesh.vertices, matrix)
+        normals = mesh.vertex_normals @ matrix[:3, :3].T
+        rows.append(np.hstack([at, mesh.visual.uv, normals])[mesh.faces].reshape(-1, 8))
+        materials.add(mesh.visual.material.name)
+    rows = np.vstack(rows).round(4) + 0.0
+    return rows[np.lexsort(rows.T)], materials
+
+
+# An OBJ of a glTF has its texture coordinates, normals and names of materials.
+before, after = corners_of(inputs / "painted.glb"), corners_of(outputs / "painted.obj")
+assert before[0].shape == after[0].shape and np.allclose(before[0], after[0], atol=2e-4)
+assert before[1] == after[1] == {"oak"}, (before[1], after[1])
+assert "newmtl oak\n" in (outputs / "labels.mtl").read_text()
+# A PLY has the normals of either, and the colours where there are some.
+for name in ("painted", "coloured"):
+    vertex = PlyData.read(outputs / f"{name}.ply")["vertex"]
+    normals = np.stack([vertex[c] for c in ("nx", "ny", "nz")], axis=1)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6), name
+at = np.stack([vertex[c] for c in "xyz"], axis=1)
+assert np.allclose(normals, np.sign(at) / np.sqrt(3), atol=1e-6)
+colours = np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1)
+assert np.array_equal(colours, np.where(at > 0, 128, 0)), colours
+# A GLB has them in linear light.
+data, root = (outputs / "coloured.glb").read_bytes(), document(outputs / "coloured.glb")
+start = 20 + struct.unpack_from("<I", data, 12)[0] + 8
+n_coloured = 0
+for primitive in (p for mesh in root["meshes"] for p in mesh["primitives"]):
+    read = {}
+    for kind in ("POSITION", "COLOR_0"):
+        accessor = root["accessors"][primitive["attributes"][kind]]
+        offset = start + root["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        read[kind] = np.frombuffer(data, "<f4", 3 * accessor["count"], offset).reshape(-1, 3)
+    light = ((0.5 + 0.055) / 1.055) ** 2.4
+    assert np.allclose(read["COLOR_0"], np.where(read["POSITION"] > 0, light, 0), atol=1e-6)
+    n_coloured += len(read["COLOR_0"])
+assert n_coloured >= 8
+print("painted.obj, painted.ply, coloured.glb and coloured.ply have attributes of the other format")
 print("painted.glb and painted-obj.obj keep what they had, painted-obj.glb what it can")
 (outputs / "parts.json").write_text(json.dumps(all_parts))

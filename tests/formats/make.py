@@ -83,3 +83,10 @@ for name, low, high in (("seat", (0, 9, 0), (20, 10, 20)), ("back", (0, 10, 0), 
         text.append("f " + " ".join(f"{n * 8 + c + 1}/{n * 4 + i + 1}/{n * 6 + normal + 1}" for i, c in enumerate(quad)))
     n += 1
 (target / "painted-obj.obj").write_text("\n".join(text) + "\n")
+
+# Colours of vertices, as scanners and sculptors write them: sRGB behind the coordinates.
+box = trimesh.creation.box((1, 2, 3))
+lines = ["v %g %g %g %g %g %g" % (*v, *(np.sign(v) + 1) / 2 * 0.5) for v in box.vertices]
+lines += ["vn %g %g %g" % tuple(np.sign(v) / np.sqrt(3)) for v in box.vertices]
+lines += ["f " + " ".join(f"{c + 1}//{c + 1}" for c in face) for face in box.faces]
+(target / "coloured.obj").write_text("\n".join(lines) + "\n")

@@ -57,7 +57,20 @@ pub(super) fn place(vertices: &[[f64; 3]]) -> Placed {
 
 /// An sRGB component as linear light, which glTF and USD require.
 pub(super) fn linear(c: u8) -> f64 {
-    let x = f64::from(c) / 255.0;
+    to_linear(f64::from(c) / 255.0)
+}
+
+/// Linear light of 0 to 1 as an sRGB component.
+pub(super) fn to_srgb(x: f64) -> f64 {
+    if x <= 0.003_130_8 {
+        12.92 * x
+    } else {
+        1.055 * x.powf(1.0 / 2.4) - 0.055
+    }
+}
+
+/// An sRGB component of 0 to 1 as linear light.
+pub(super) fn to_linear(x: f64) -> f64 {
     if x <= 0.04045 {
         x / 12.92
     } else {

@@ -5,7 +5,8 @@
 //! indices: attributes, materials, morph targets and extensions are the same entries as before, and
 //! nothing is encoded again.
 
-use super::glb::{Document, field, glb_of, list, part, polygons};
+use super::glb::{Document, glb_of, list, part, polygons};
+use super::paint::Painter;
 use super::{Labelling, Materials};
 use crate::mesh::parse::as_utf8;
 use crate::mesh::parse::gltf::buffers::{BASE64, data_uri};
@@ -15,7 +16,6 @@ use base64::Engine as _;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
-const VARIANTS: &str = "KHR_materials_variants";
 /// Draws a node's mesh many times, so it goes with the mesh.
 const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 /// Hold triangles of a whole primitive or mesh, which is no longer whole.
@@ -66,8 +66,7 @@ pub fn labelled_gltf(
     let mut patch = Patch {
         document,
         labelling,
-        materials,
-        variant: None,
+        painter: Painter::new(materials),
     };
     patch.add_scene();
     patch.split(&mesh, &spans);
@@ -128,9 +127,7 @@ fn close(document: Document, encoded: bool) -> Vec<u8> {
 struct Patch<'a> {
     document: Document,
     labelling: &'a Labelling<'a>,
-    materials: Materials,
-    /// The variant of materials that was added.
-    variant: Option<usize>,
+    painter: Painter,
 }
 
 /// The triangles of one part instance that come from one span.
@@ -279,41 +276,14 @@ impl Patch<'_> {
                     .into_iter()
                     .for_each(|(key, value)| extras[key.as_str()] = value);
             }
-            self.paint(&mut primitive, label);
+            let labelling = self.labelling;
+            self.painter
+                .paint(&mut self.document, &mut primitive, (label, labelling));
             primitive
         });
         let primitives: Vec<Value> = primitives.collect();
         mesh["primitives"] = primitives.into();
         mesh
-    }
-
-    fn paint(&mut self, primitive: &mut Value, label: i32) {
-        let of_label = self.document.material(label, self.labelling);
-        let Some(own) = index(&primitive["material"]) else {
-            primitive["material"] = of_label.into();
-            return;
-        };
-        let (shown, other, name) = match self.materials {
-            Materials::Own => (own, of_label, "labels"),
-            Materials::Labels => (of_label, own, "original"),
-        };
-        primitive["material"] = shown.into();
-        let variant = match self.variant {
-            Some(variant) => variant,
-            None => {
-                let used = self.document.list("extensionsUsed");
-                if !used.iter().any(|name| name == VARIANTS) {
-                    used.push(VARIANTS.into());
-                }
-                let extensions = field(&mut self.document.root, "extensions");
-                let variants = list(field(extensions, VARIANTS), "variants");
-                variants.push(json!({ "name": name }));
-                *self.variant.insert(variants.len() - 1)
-            }
-        };
-        let extensions = field(primitive, "extensions");
-        let mappings = list(field(extensions, VARIANTS), "mappings");
-        mappings.push(json!({ "material": other, "variants": [variant] }));
     }
 
     /// Hangs part instances below the node whose mesh they were.
@@ -383,7 +353,7 @@ impl Patch<'_> {
 }
 
 /// An index, which may be written as `3.0`.
-fn index(value: &Value) -> Option<usize> {
+pub(super) fn index(value: &Value) -> Option<usize> {
     let number = value.as_f64()?;
     (number >= 0.0 && number.fract() == 0.0).then_some(number as usize)
 }

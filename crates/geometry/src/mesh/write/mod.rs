@@ -3,20 +3,23 @@
 //! Coordinates are written with enough digits to read the same number back; labels keep the order
 //! of the polygons.
 
+mod attributes;
 mod glb;
 mod gltf;
 mod labelling;
 mod obj;
 mod obj_glb;
+mod paint;
 mod ply;
 mod usda;
 
+pub use attributes::{Attributes, OwnMaterial};
 pub use glb::{glb, glb_of};
 pub use gltf::labelled_gltf;
 pub use labelling::{LabelStyle, Labelling, Materials};
-pub use obj::{labelled_obj, mtl, obj};
+pub use obj::{OwnNames, labelled_obj, mtl, mtl_entry, obj, obj_with};
 pub use obj_glb::glb_of_obj;
-pub use ply::ply;
+pub use ply::{ply, ply_with};
 pub use usda::usda;
 
 use super::TriMesh;

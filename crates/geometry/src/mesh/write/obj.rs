@@ -5,8 +5,9 @@
 //! which ones a group has: `# label 2` and `# faces 0-12 15`, counted from 0 in the order of the
 //! input.
 
+use super::attributes::Kind;
 use super::labelling::{runs, unique_names};
-use super::{LabelStyle, Labelling, Materials, append, line};
+use super::{Attributes, LabelStyle, Labelling, Materials, append, line};
 use crate::mesh::parse::text::words;
 use crate::mesh::parse::{as_utf8, obj as reader};
 use crate::mesh::{Format, Instances, ParseError, instances, parse};
@@ -73,6 +74,26 @@ pub fn obj<P: AsRef<[u32]>>(
     labelling: &Labelling<'_>,
     material_file: &str,
 ) -> String {
+    let none = (&Attributes::default(), None);
+    obj_with(vertices, polygons, labelling, material_file, none)
+}
+
+/// Names in `material_file` of the materials of [`Attributes`], by index.
+pub type OwnNames<'a> = &'a [String];
+
+/// Like [`obj`], with the texture coordinates, normals and colours of another file. Faces have
+/// their own materials under the given names; without names, or a material, that of their label.
+/// Colours are of vertices here (`v x y z r g b`), so there are none if a vertex has two.
+///
+/// # Panics
+/// If there is not one label per polygon, and one name per material.
+pub fn obj_with<P: AsRef<[u32]>>(
+    vertices: &[[f64; 3]],
+    polygons: &[P],
+    labelling: &Labelling<'_>,
+    material_file: &str,
+    (attributes, own): (&Attributes, Option<OwnNames<'_>>),
+) -> String {
     let found = instances(
         vertices,
         polygons,
@@ -82,9 +103,7 @@ pub fn obj<P: AsRef<[u32]>>(
     let (names, materials) = (group_names(labelling, &found), labelling.names(spelled));
     let mut out = String::with_capacity(60 * vertices.len() + 20 * polygons.len());
     line(&mut out, format_args!("mtllib {material_file}"));
-    for [x, y, z] in vertices {
-        line(&mut out, format_args!("v {x} {y} {z}"));
-    }
+    tables(&mut out, vertices, polygons, attributes);
     let mut members: Vec<Vec<u32>> = vec![Vec::new(); names.len()];
     for (polygon, &instance) in (0..).zip(&found.of_polygon) {
         members[instance as usize].push(polygon);
@@ -92,17 +111,71 @@ pub fn obj<P: AsRef<[u32]>>(
     for ((name, label), members) in names.iter().zip(&found.labels).zip(&members) {
         line(&mut out, format_args!("g {name}"));
         comments(&mut out, *label, members);
-        line(&mut out, format_args!("usemtl {}", materials[label]));
+        let mut set = "";
         for &polygon in members {
-            out.push('f');
-            for corner in polygons[polygon as usize].as_ref() {
-                // OBJ counts from 1; u64 holds the successor of every u32.
-                append(&mut out, format_args!(" {}", u64::from(*corner) + 1));
+            let named = own.zip(attributes.material(polygon));
+            let material = named.map_or(materials[label].as_str(), |(own, i)| own[i].as_str());
+            if material != set {
+                line(&mut out, format_args!("usemtl {material}"));
+                set = material;
             }
-            out.push('\n');
+            face(
+                &mut out,
+                polygon,
+                polygons[polygon as usize].as_ref(),
+                attributes,
+            );
         }
     }
     out
+}
+
+/// Positions, with their colours if they have them, texture coordinates and normals.
+fn tables<P: AsRef<[u32]>>(
+    out: &mut String,
+    vertices: &[[f64; 3]],
+    polygons: &[P],
+    attributes: &Attributes,
+) {
+    let values = &attributes.colours;
+    let colours = attributes.of_vertices(polygons, vertices.len(), Kind::Colour, values);
+    for (i, [x, y, z]) in vertices.iter().enumerate() {
+        append(out, format_args!("v {x} {y} {z}"));
+        if let Some(colours) = &colours {
+            // Every vertex has a colour, or readers expect none.
+            let [r, g, b] = colours[i].map_or([1.0; 3], |at| values[at as usize]);
+            append(out, format_args!(" {r} {g} {b}"));
+        }
+        out.push('\n');
+    }
+    for [u, v] in &attributes.texture {
+        line(out, format_args!("vt {u} {v}"));
+    }
+    for [x, y, z] in &attributes.normals {
+        line(out, format_args!("vn {x} {y} {z}"));
+    }
+}
+
+/// A face: OBJ counts from 1, and u64 holds the successor of every u32.
+fn face(out: &mut String, polygon: u32, corners: &[u32], attributes: &Attributes) {
+    out.push('f');
+    for (i, corner) in corners.iter().enumerate() {
+        let index = |kind| {
+            attributes
+                .corner(polygon, i, kind)
+                .map(|at| u64::from(at) + 1)
+        };
+        let vertex = u64::from(*corner) + 1;
+        match (index(Kind::Texture), index(Kind::Normal)) {
+            (None, None) => append(out, format_args!(" {vertex}")),
+            (Some(texture), None) => append(out, format_args!(" {vertex}/{texture}")),
+            (None, Some(normal)) => append(out, format_args!(" {vertex}//{normal}")),
+            (Some(texture), Some(normal)) => {
+                append(out, format_args!(" {vertex}/{texture}/{normal}"));
+            }
+        }
+    }
+    out.push('\n');
 }
 
 /// Materials for [`obj`] and [`labelled_obj`], as MTL text: a name and a diffuse sRGB colour each.
@@ -117,13 +190,20 @@ pub fn mtl(styles: &BTreeMap<i32, LabelStyle>) -> String {
     let named = unique_names(styles.iter().map(|(&l, s)| (l, s.clone())), spelled);
     let mut out = String::new();
     for (label, name) in named {
-        let [r, g, b] = styles[&label].colour.map(|c| f64::from(c) / 255.0);
-        line(
-            &mut out,
-            format_args!("newmtl {name}\nKd {r:.4} {g:.4} {b:.4}"),
-        );
+        out.push_str(&mtl_entry(&name, styles[&label].colour));
     }
     out
+}
+
+/// A material of MTL text: a name without white space, and a diffuse sRGB colour.
+///
+/// ```
+/// let entry = coseg_geometry::mesh::write::mtl_entry("oak", [255, 0, 0]);
+/// assert_eq!(entry, "newmtl oak\nKd 1.0000 0.0000 0.0000\n");
+/// ```
+pub fn mtl_entry(name: &str, colour: [u8; 3]) -> String {
+    let [r, g, b] = colour.map(|c| f64::from(c) / 255.0);
+    format!("newmtl {name}\nKd {r:.4} {g:.4} {b:.4}\n")
 }
 
 /// What statements before an element set for it; as in the file, empty where nothing is set.

@@ -1,12 +1,15 @@
 //! Writes an OBJ file as a binary glTF 2.0 file with what the OBJ says of its surface.
 //!
 //! Objects become nodes, and their part instances nodes below them; texture coordinates and normals
-//! become attributes. An OBJ only names its materials, which are in another file. So each material
-//! of a part is a primitive that names it in its `extras` and has the material of the label.
+//! become attributes, and so do colours of vertices (`v x y z r g b`). An OBJ only names its
+//! materials, which are in another file. So each material of a part is a primitive that names it in
+//! its `extras` and has the material of the label, or one that shows the colours of vertices.
 
-use super::Labelling;
-use super::glb::{Document, Placed, finish, new_document, part, place, polygons};
+use super::attributes::colours_of_obj;
+use super::glb::{Document, Placed, finish, new_document, part, place, polygons, to_linear};
 use super::obj::Statements;
+use super::paint::Painter;
+use super::{Labelling, Materials};
 use crate::mesh::parse::text::words;
 use crate::mesh::parse::{as_utf8, obj as reader};
 use crate::mesh::{Format, ParseError, Triangulator, instances, parse};
@@ -14,20 +17,21 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, HashMap};
 
 /// A corner of a face: its position, and its texture coordinates and normal if it has them.
-type Corner = (u32, Option<u32>, Option<u32>);
+pub(super) type Corner = (u32, Option<u32>, Option<u32>);
 
 /// A binary glTF file of an OBJ file, called `name`, with a node for each of its objects and, below
 /// it, for each part instance. If the coordinate axis `up` is not +Y, a node around them turns it
-/// there.
+/// there. A file with colours of vertices shows them for [`Materials::Own`], with the materials of
+/// the labels in a variant `labels` (`KHR_materials_variants`); otherwise parts show their labels.
 ///
 /// ```
-/// use coseg_geometry::mesh::write::{self, Labelling};
+/// use coseg_geometry::mesh::write::{self, Labelling, Materials};
 /// use coseg_geometry::mesh::{Format, parse};
 ///
 /// let file = b"o box\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl wood\nf 1/1 2/1 3/1\n";
 /// let styles = Default::default();
 /// let labelling = Labelling { labels: &[2], confidence: None, styles: &styles };
-/// let found = write::glb_of_obj("a", file, &labelling, None)?;
+/// let found = write::glb_of_obj("a", file, &labelling, Materials::Own, None)?;
 /// assert_eq!(parse(&found, Format::Gltf)?.n_polygons, 1);
 /// let text = String::from_utf8_lossy(&found);
 /// assert!(["TEXCOORD_0", "\"box\"", "\"wood\""].iter().all(|part| text.contains(part)));
@@ -43,6 +47,7 @@ pub fn glb_of_obj(
     name: &str,
     bytes: &[u8],
     labelling: &Labelling<'_>,
+    materials: Materials,
     up: Option<[f64; 3]>,
 ) -> Result<Vec<u8>, ParseError> {
     let bytes = as_utf8(bytes);
@@ -73,14 +78,27 @@ pub fn glb_of_obj(
     }
     let names = labelling.names(str::to_owned);
     let (mut document, placed) = (new_document(), place(vertices));
+    let mut painter = Painter::new(materials);
+    // The colour of a material is multiplied with those of the vertices.
+    let is_coloured = !tables.colours.is_empty() && materials == Materials::Own;
+    let white = is_coloured.then(|| {
+        let shading = json!({ "metallicFactor": 0.0, "roughnessFactor": 0.8 });
+        let white = json!({ "name": "vertex colours", "doubleSided": true,
+            "pbrMetallicRoughness": shading });
+        document.push("materials", white)
+    });
     let mut of_objects: BTreeMap<u32, Vec<Value>> = BTreeMap::new();
     for (instance, primitives) in parts.iter().enumerate() {
         let (label, number) = (found.labels[instance], found.numbers[instance]);
         let primitives: Vec<Value> = primitives
             .iter()
             .map(|(material, primitive)| {
-                let mut primitive = primitive.write(&mut document, &tables, &placed, label);
-                primitive["material"] = document.material(label, labelling).into();
+                let of = (label, materials);
+                let mut primitive = primitive.write(&mut document, &tables, &placed, of);
+                if let Some(white) = white {
+                    primitive["material"] = white.into();
+                }
+                painter.paint(&mut document, &mut primitive, (label, labelling));
                 if !material.is_empty() {
                     primitive["extras"]["material"] = String::from_utf8_lossy(material).into();
                 }
@@ -111,15 +129,20 @@ pub fn glb_of_obj(
 
 /// Texture coordinates and normals of a file, as glTF has them.
 #[derive(Default)]
-struct Tables {
-    texture: Vec<[f32; 2]>,
+pub(super) struct Tables {
+    pub(super) texture: Vec<[f32; 2]>,
     /// None where a normal has no direction.
-    normals: Vec<Option<[f32; 3]>>,
+    pub(super) normals: Vec<Option<[f32; 3]>>,
+    /// sRGB, for each vertex of the file; empty without any.
+    pub(super) colours: Vec<[f32; 3]>,
 }
 
 impl Tables {
-    fn of(bytes: &[u8]) -> Result<Self, ParseError> {
-        let mut found = Self::default();
+    pub(super) fn of(bytes: &[u8]) -> Result<Self, ParseError> {
+        let mut found = Self {
+            colours: colours_of_obj(bytes)?,
+            ..Self::default()
+        };
         reader::statements(bytes, |statement, _, _| {
             let mut words = words(statement);
             match words.next() {
@@ -143,7 +166,7 @@ impl Tables {
     }
 
     /// The corners of a face; texture coordinates and normals that the file lacks are none.
-    fn corners(&self, element: &[u8], polygon: &[u32]) -> Vec<Corner> {
+    pub(super) fn corners(&self, element: &[u8], polygon: &[u32]) -> Vec<Corner> {
         let words = words(element).skip(1).zip(polygon);
         words
             .map(|(word, &vertex)| {
@@ -195,13 +218,13 @@ impl Primitive {
     }
 
     /// Adds attributes and indices. Normals are there if all corners have one; texture coordinates
-    /// if any has, and those of others are 0.
+    /// if any has, and those of others are 0; colours if any vertex of the file has one.
     fn write(
         &self,
         document: &mut Document,
         tables: &Tables,
         placed: &Placed,
-        label: i32,
+        (label, materials): (i32, Materials),
     ) -> Value {
         let corners = || self.vertices.iter();
         let positions: Vec<[f32; 3]> = corners().map(|c| placed.positions[c.0 as usize]).collect();
@@ -215,6 +238,12 @@ impl Primitive {
             let texture: Vec<[f32; 2]> = corners().map(texture).collect();
             attributes["TEXCOORD_0"] = document.attribute(&texture).into();
         }
+        if !tables.colours.is_empty() && materials == Materials::Own {
+            let colour = |c: &Corner| tables.colours[c.0 as usize];
+            let light = |c: &Corner| colour(c).map(|x| to_linear(f64::from(x)) as f32);
+            let colours: Vec<[f32; 3]> = corners().map(light).collect();
+            attributes["COLOR_0"] = document.attribute(&colours).into();
+        }
         let indices = document.indices(&self.indices);
         let extras = polygons(label, &self.members);
         json!({ "attributes": attributes, "indices": indices, "extras": extras })
@@ -223,7 +252,7 @@ impl Primitive {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Labelling;
+    use super::super::{Labelling, Materials};
     use super::glb_of_obj;
     use crate::mesh::parse::gltf::container;
     use crate::mesh::{Format, parse};
@@ -241,7 +270,7 @@ mod tests {
             confidence: None,
             styles: &Default::default(),
         };
-        let bytes = glb_of_obj("a", FILE.as_bytes(), &labelling, None).unwrap();
+        let bytes = glb_of_obj("a", FILE.as_bytes(), &labelling, Materials::Own, None).unwrap();
         let (json, _) = container(&bytes).unwrap();
         (serde_json::from_slice(json).unwrap(), bytes)
     }
@@ -301,5 +330,49 @@ mod tests {
         assert!(lid["TEXCOORD_0"].is_null());
         let accessor = &root["accessors"][oak["TEXCOORD_0"].as_u64().unwrap() as usize];
         assert_eq!(accessor["type"], "VEC2");
+    }
+
+    #[test]
+    fn colours_of_vertices_become_an_attribute_in_linear_light() {
+        const COLOURED: &str = "v 0 0 0 1 0 0.5\nv 1 0 0 0 1 0\nv 0 1 0\nf 1 2 3\n";
+        let labelling = Labelling {
+            labels: &[3],
+            confidence: None,
+            styles: &Default::default(),
+        };
+        let read = |text: &str, materials| {
+            let bytes = glb_of_obj("a", text.as_bytes(), &labelling, materials, None).unwrap();
+            let (json, binary) = container(&bytes).unwrap();
+            let root: Value = serde_json::from_slice(json).unwrap();
+            (root, binary.unwrap().to_vec())
+        };
+        // Of 0 to 1, and of 0 to 255.
+        let bytes = COLOURED.replace("1 0 0.5\n", "255 0 127.5\n");
+        let bytes = bytes.replace("0 1 0\nv", "0 255 0\nv");
+        for text in [COLOURED, bytes.as_str()] {
+            let (root, binary) = read(text, Materials::Own);
+            let primitive = &root["meshes"][0]["primitives"][0];
+            let accessor = primitive["attributes"]["COLOR_0"].as_u64().unwrap() as usize;
+            let view = root["accessors"][accessor]["bufferView"].as_u64().unwrap() as usize;
+            let start = root["bufferViews"][view]["byteOffset"].as_u64().unwrap() as usize;
+            let (chunks, _) = binary[start..start + 36].as_chunks::<4>();
+            let found: Vec<f32> = chunks.iter().map(|b| f32::from_le_bytes(*b)).collect();
+            // sRGB 0.5 is 0.214 of the light; a vertex without a colour is white.
+            let expected = [1.0, 0.0, 0.214, 0.0, 1.0, 0.0, 1.0, 1.0, 1.0];
+            for (f, e) in found.iter().zip(expected) {
+                assert!((f - e).abs() < 1e-3, "{found:?}");
+            }
+            let material = |i: &Value| root["materials"][i.as_u64().unwrap() as usize].clone();
+            assert_eq!(material(&primitive["material"])["name"], "vertex colours");
+            let variants = &primitive["extensions"]["KHR_materials_variants"];
+            assert_eq!(
+                material(&variants["mappings"][0]["material"])["name"],
+                "label_3"
+            );
+        }
+        let (root, _) = read(COLOURED, Materials::Labels);
+        let primitive = &root["meshes"][0]["primitives"][0];
+        assert!(primitive["attributes"]["COLOR_0"].is_null() && root["materials"][1].is_null());
+        assert_eq!(root["materials"][0]["name"], "label_3");
     }
 }

@@ -1,6 +1,7 @@
 //! Labelled polygons become a binary PLY file.
 
-use super::line;
+use super::attributes::Kind;
+use super::{Attributes, Materials, line};
 use std::cmp::Ordering;
 
 /// Grey of vertices that no polygon uses.
@@ -27,6 +28,23 @@ pub fn ply<P: AsRef<[u32]>>(
     colours: &[[u8; 3]],
     labels: &[i32],
 ) -> Vec<u8> {
+    let none = (&Attributes::default(), Materials::Labels);
+    ply_with(vertices, polygons, colours, labels, none)
+}
+
+/// Like [`ply`], with the normals of another file (`float nx ny nz`) and, for [`Materials::Own`],
+/// its colours at the vertices; faces have the colours of their labels. A vertex has one of either
+/// here: if one has two normals, as at a sharp edge, there are none, and so with colours.
+///
+/// # Panics
+/// If there is not one colour and one label per polygon.
+pub fn ply_with<P: AsRef<[u32]>>(
+    vertices: &[[f64; 3]],
+    polygons: &[P],
+    colours: &[[u8; 3]],
+    labels: &[i32],
+    (attributes, materials): (&Attributes, Materials),
+) -> Vec<u8> {
     assert_eq!(polygons.len(), colours.len(), "one colour per polygon");
     assert_eq!(polygons.len(), labels.len(), "one label per polygon");
     // A one-byte count is what most readers expect; it is widened only when a polygon needs it.
@@ -40,6 +58,13 @@ pub fn ply<P: AsRef<[u32]>>(
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     line(&mut header, format_args!("element vertex {n_vertices}"));
     header.push_str("property double x\nproperty double y\nproperty double z\n");
+    let values = (&attributes.normals, &attributes.colours);
+    let normals = attributes.of_vertices(polygons, n_vertices, Kind::Normal, values.0);
+    let own = attributes.of_vertices(polygons, n_vertices, Kind::Colour, values.1);
+    let own = own.filter(|_| materials == Materials::Own);
+    if normals.is_some() {
+        header.push_str("property float nx\nproperty float ny\nproperty float nz\n");
+    }
     header.push_str(PAINT);
     line(&mut header, format_args!("element face {n_polygons}"));
     line(
@@ -49,17 +74,27 @@ pub fn ply<P: AsRef<[u32]>>(
     header.push_str(PAINT);
     header.push_str("end_header\n");
     let mut out = header.into_bytes();
-    let paint = |out: &mut Vec<u8>, polygon: Option<u32>| {
+    let paint = |out: &mut Vec<u8>, polygon: Option<u32>, own: Option<[u8; 3]>| {
         let (colour, label) = match polygon {
             Some(polygon) => (colours[polygon as usize], labels[polygon as usize]),
             None => (UNUSED, -1),
         };
+        let colour = own.unwrap_or(colour);
         out.extend_from_slice(&colour);
         out.extend_from_slice(&label.to_le_bytes());
     };
-    for (vertex, shown) in vertices.iter().zip(shown_at(vertices, polygons, labels)) {
+    let shown = shown_at(vertices, polygons, labels);
+    for (i, (vertex, shown)) in vertices.iter().zip(shown).enumerate() {
         out.extend(vertex.iter().flat_map(|x| x.to_le_bytes()));
-        paint(&mut out, shown);
+        if let Some(normals) = &normals {
+            let normal = normals[i].map_or([0.0; 3], |at| values.0[at as usize]);
+            out.extend(normal.iter().flat_map(|x| x.to_le_bytes()));
+        }
+        let colour = own.as_ref().map(|own| {
+            let colour = own[i].map_or([1.0; 3], |at| values.1[at as usize]);
+            colour.map(|x| (255.0 * x).round() as u8)
+        });
+        paint(&mut out, shown, colour);
     }
     for (polygon, corners) in (0..).zip(polygons) {
         let corners = corners.as_ref();
@@ -71,7 +106,7 @@ pub fn ply<P: AsRef<[u32]>>(
         for corner in corners {
             out.extend_from_slice(&corner.to_le_bytes());
         }
-        paint(&mut out, Some(polygon));
+        paint(&mut out, Some(polygon), None);
     }
     out
 }

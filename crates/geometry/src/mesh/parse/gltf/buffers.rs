@@ -78,27 +78,63 @@ impl<'a> Buffers<'a> {
         if it.dimensions != "VEC3" {
             return Err(wrong());
         }
-        match component(it.component_type, || format!("accessors[{}]", accessor.0))? {
-            Component::F32 => self.points::<f32>(accessor, None),
-            Component::I8 => self.points::<i8>(accessor, Some(127.0)),
-            Component::U8 => self.points::<u8>(accessor, Some(255.0)),
-            Component::I16 => self.points::<i16>(accessor, Some(32_767.0)),
-            Component::U16 => self.points::<u16>(accessor, Some(65_535.0)),
-            Component::U32 => Err(wrong()),
-        }
+        self.reals(accessor)?.ok_or_else(wrong)
     }
 
-    fn points<T: Pod + Into<f64>>(
+    /// The entries of an accessor of two to four real numbers, padded with zeros; normalised
+    /// integers are in −1 to 1.
+    pub(super) fn vectors(&self, accessor: Whole) -> Result<Vec<[f64; 4]>, ParseError> {
+        fn padded<const N: usize>(values: Vec<[f64; N]>) -> Vec<[f64; 4]> {
+            let pad = |v: [f64; N]| std::array::from_fn(|i| v.get(i).copied().unwrap_or(0.0));
+            values.into_iter().map(pad).collect()
+        }
+        let found = match self.document.accessors[accessor.0].dimensions.as_str() {
+            "VEC2" => self.reals::<2>(accessor)?.map(padded),
+            "VEC3" => self.reals::<3>(accessor)?.map(padded),
+            "VEC4" => self.reals::<4>(accessor)?.map(padded),
+            _ => None,
+        };
+        found.ok_or_else(|| {
+            let location = format_args!("accessor {}", accessor.0);
+            fault(location, "holds no vectors of float, byte or short")
+        })
+    }
+
+    /// `None` for integers of 32 bits, which glTF has for indices alone.
+    fn reals<const N: usize>(&self, accessor: Whole) -> Result<Option<Vec<[f64; N]>>, ParseError>
+    where
+        [f32; N]: Pod,
+        [i8; N]: Pod,
+        [u8; N]: Pod,
+        [i16; N]: Pod,
+        [u16; N]: Pod,
+    {
+        let code = self.document.accessors[accessor.0].component_type;
+        let found = match component(code, || format!("accessors[{}]", accessor.0))? {
+            Component::F32 => self.points::<f32, N>(accessor, None),
+            Component::I8 => self.points::<i8, N>(accessor, Some(127.0)),
+            Component::U8 => self.points::<u8, N>(accessor, Some(255.0)),
+            Component::I16 => self.points::<i16, N>(accessor, Some(32_767.0)),
+            Component::U16 => self.points::<u16, N>(accessor, Some(65_535.0)),
+            Component::U32 => return Ok(None),
+        };
+        found.map(Some)
+    }
+
+    fn points<T: Pod + Into<f64>, const N: usize>(
         &self,
         accessor: Whole,
         largest: Option<f64>,
-    ) -> Result<Vec<[f64; 3]>, ParseError> {
+    ) -> Result<Vec<[f64; N]>, ParseError>
+    where
+        [T; N]: Pod,
+    {
         let largest = largest.filter(|_| self.document.accessors[accessor.0].normalized);
         let real = |value: T| match largest {
             Some(largest) => (value.into() / largest).max(-1.0),
             None => value.into(),
         };
-        let values = self.values::<[T; 3]>(accessor)?;
+        let values = self.values::<[T; N]>(accessor)?;
         Ok(values.into_iter().map(|point| point.map(real)).collect())
     }
 

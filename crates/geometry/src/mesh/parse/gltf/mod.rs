@@ -113,6 +113,8 @@ pub(in crate::mesh) struct Span {
     pub(in crate::mesh) first_vertex: u32,
     /// Whether the second and third corner of each triangle have changed places.
     pub(in crate::mesh) mirrored: bool,
+    /// By which the primitive is placed.
+    pub(in crate::mesh) transform: Matrix4<f64>,
 }
 
 /// The scene during its assembly.
@@ -173,6 +175,7 @@ impl Scene<'_> {
                     polygons,
                     first_vertex,
                     mirrored,
+                    transform: *to,
                 });
             }
         }
@@ -393,6 +396,26 @@ pub(in crate::mesh) fn spans(bytes: &[u8]) -> Result<(ParsedMesh, Vec<Span>), Pa
     }
     let spans = scene.spans;
     Ok((scene.polygons.finish()?, spans))
+}
+
+/// Gives `read` a function for accessors that triangles do not need: from the index of an accessor
+/// and the number of its entries to these, with zeros for missing components; `None` if they cannot
+/// be read, or are not as many.
+pub(in crate::mesh) fn with_vectors<R>(
+    bytes: &[u8],
+    read: impl FnOnce(&dyn Fn(usize, usize) -> Option<Vec<[f64; 4]>>) -> R,
+) -> Result<R, ParseError> {
+    let (text, binary) = container(bytes)?;
+    let document = Document::read(text)?;
+    let buffers = Buffers::new(&document, binary);
+    Ok(read(&|accessor, count| {
+        let it = document.accessors.get(accessor)?;
+        // An accessor without a view is as long as it says.
+        if it.count.0 != count {
+            return None;
+        }
+        buffers.vectors(Whole(accessor)).ok()
+    }))
 }
 
 #[cfg(test)]
