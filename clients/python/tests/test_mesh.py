@@ -9,12 +9,13 @@ from typing import Any
 
 import meshio
 import numpy as np
+import potpourri3d
 import pytest
 import trimesh
-from shapes import icosphere, sphere
+from shapes import icosphere, lumpy, sphere
 
 import coseg
-from coseg.geometry import Mesh
+from coseg.geometry import Geodesics, Mesh
 
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
 f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8
@@ -174,3 +175,74 @@ def test_distances_along_edges() -> None:
 
 def _both(mesh: Mesh) -> Any:
     return np.concatenate([mesh.faces, mesh.faces + mesh.n_vertices])
+
+
+def test_geodesics_on_a_sphere_are_angles() -> None:
+    mesh = sphere(4)
+    sources = [0, 11, 700]
+    exact = np.arccos(np.clip(mesh.vertices[sources] @ mesh.vertices.T, -1, 1))
+    found = mesh.geodesics(sources)
+    assert found.shape == (3, mesh.n_vertices)
+    assert (found[[0, 1, 2], sources] == 0).all() and found.min() >= 0
+    assert np.abs(found - exact).mean() < 0.01 * np.pi
+    along = mesh.geodesics(sources, method="edges")
+    assert np.array_equal(along, mesh.edge_distances(sources))
+    assert np.abs(found - exact).mean() < 0.5 * np.abs(along - exact).mean()
+    # In the unit of the coordinates; one vertex is a list of one; the same from a prepared solver.
+    large = Mesh(1000 * mesh.vertices, mesh.faces)
+    assert np.allclose(large.geodesics(11)[0], 1000 * found[1], rtol=1e-9, atol=1e-6)
+    solver = Geodesics(mesh)
+    assert np.array_equal(solver.distances(sources), found)
+    assert repr(solver) == "Geodesics(2562 vertices, heat, time 1)"
+    assert mesh.geodesics([]).shape == (0, mesh.n_vertices)
+
+
+def test_geodesics_on_a_plane_are_straight() -> None:
+    n = 60
+    x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0)))
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
+    faces = np.concatenate([corner + [0, 1, n + 2], corner + [0, n + 2, n + 1]])
+    plane = Mesh(np.stack([x, y, np.zeros_like(x)], axis=1), faces)
+    for source in (0, n // 2 * (n + 2)):
+        exact = np.hypot(x - x[source], y - y[source])
+        found = plane.geodesics(source)[0]
+        assert np.abs(found - exact).mean() < 0.01 * exact.max()
+        assert np.abs(found - exact).max() < 0.03 * exact.max()
+
+
+def test_geodesics_agree_with_another_implementation() -> None:
+    vertices, faces = lumpy(4)
+    solver = potpourri3d.MeshHeatMethodDistanceSolver(vertices, faces)
+    theirs = solver.compute_distance(5)
+    ours = Mesh(vertices, faces).geodesics(5)[0]
+    # The same method; mean edges and mollification differ in details.
+    assert np.abs(ours - theirs).max() < 0.01 * theirs.max()
+
+
+def test_geodesics_of_what_has_none() -> None:
+    mesh = sphere(2)
+    apart = Mesh(np.concatenate([mesh.vertices, mesh.vertices + 5]), _both(mesh))
+    far = apart.geodesics(0)[0]
+    assert np.isinf(far[mesh.n_vertices :]).all() and np.isfinite(far[: mesh.n_vertices]).all()
+    with pytest.raises(coseg.GeometryError, match="sources name 162, but there are 162 vertices"):
+        mesh.geodesics([0, 162])
+    with pytest.raises(coseg.GeometryError, match="integers"):
+        mesh.geodesics(0.5)
+    with pytest.raises(coseg.GeometryError, match='method is \'exact\', but must be "heat" or "edges"'):
+        mesh.geodesics(0, method="exact")  # type: ignore[arg-type]
+    for time in (0.0, -1.0, float("nan")):
+        with pytest.raises(coseg.GeometryError, match="must be positive and finite") as raised:
+            mesh.geodesics(0, time=time)
+        assert raised.value.kind == "Time"
+    with pytest.raises(coseg.LaplacianError, match="vertex 162 belongs to no face"):
+        Mesh(np.concatenate([mesh.vertices, [[0.0, 0, 9]]]), mesh.faces).geodesics(0)
+    # A ribbon of 3,000 squares: what a double holds of heat ends after a thousand.
+    n = 3000
+    at = np.arange(n + 1.0)
+    ribbon = np.stack([np.tile(at, 2), np.repeat([0.0, 1.0], n + 1), np.zeros(2 * n + 2)], axis=1)
+    first = np.arange(n)[:, None]
+    long = Mesh(ribbon, np.concatenate([first + [0, 1, n + 2], first + [0, n + 2, n + 1]]))
+    with pytest.raises(coseg.GeometryError, match="give a time of 4 or more") as cold:
+        long.geodesics(0)
+    assert (cold.value.kind, cold.value.vertex is not None) == ("OutOfReach", True)
+    assert long.geodesics(0, time=16.0)[0, n] == pytest.approx(n, rel=0.01)

@@ -11,6 +11,7 @@
 pub mod linalg;
 pub mod mesh;
 pub mod operators;
+pub mod geodesics;
 pub mod spectrum;
 pub mod description;
 pub mod descriptors;

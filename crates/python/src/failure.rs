@@ -2,6 +2,7 @@
 
 use coseg_geometry::describe::DescribeError;
 use coseg_geometry::fmap::solve::SolveError;
+use coseg_geometry::geodesics::GeodesicError;
 use coseg_geometry::mesh::{CleanError, ParseError};
 use coseg_geometry::operators::LaplacianError;
 use coseg_geometry::spectrum::SpectrumError;
@@ -120,6 +121,18 @@ impl From<LaplacianError> for Failure {
                 failure.at("face", face).at("vertex", vertex as usize)
             }
             E::DegenerateFace { face, .. } => failure.at("face", face),
+            _ => failure,
+        }
+    }
+}
+
+impl From<GeodesicError> for Failure {
+    fn from(error: GeodesicError) -> Self {
+        let failure = Self::new("GeometryError", &error);
+        match error {
+            GeodesicError::Laplacian(error) => error.into(),
+            GeodesicError::Source { vertex, .. } => failure.at("vertex", vertex as usize),
+            GeodesicError::OutOfReach { vertex, .. } => failure.at("vertex", vertex),
             _ => failure,
         }
     }

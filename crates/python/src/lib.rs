@@ -3,6 +3,7 @@
 mod arrays;
 mod describe;
 mod failure;
+mod geodesics;
 mod maps;
 mod mesh;
 mod picture;
@@ -17,6 +18,7 @@ use pyo3::wrap_pyfunction;
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add_class::<shape::Shape>()?;
+    module.add_class::<geodesics::HeatGeodesics>()?;
     module.add_function(wrap_pyfunction!(mesh::parse, module)?)?;
     module.add_function(wrap_pyfunction!(mesh::triangulate, module)?)?;
     module.add_function(wrap_pyfunction!(mesh::clean, module)?)?;

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "HeatGeodesics",
     "Shape",
     "__version__",
     "clean",
@@ -46,6 +47,10 @@ _I32 = NDArray[np.int32]
 _Bool = NDArray[np.bool_]
 _Progress = Callable[[str, int, int], None] | None
 
+@final
+class HeatGeodesics:
+    def __new__(cls, vertices: _F64, faces: _U32, time: float) -> HeatGeodesics: ...
+    def distances(self, sources: _U32, progress: _Progress) -> _F64: ...
 @final
 class Shape:
     def __new__(

@@ -5,6 +5,7 @@ mod mesh_laplace;
 mod tufted;
 
 use crate::mesh::{Bridge, TriMesh};
+pub(crate) use tufted::IntrinsicFace;
 
 /// The kinds of discrete Laplacians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -144,11 +145,29 @@ pub fn laplacian(
     operator: Operator,
 ) -> Result<Laplacian, LaplacianError> {
     check(mesh, bridges)?;
-    let (mut edges, mass) = match operator {
-        Operator::Tufted => tufted::tufted(mesh),
+    let (edges, mass) = match operator {
+        Operator::Tufted => tufted::tufted(mesh).weights(mesh.vertices.len()),
         Operator::Cotan => cotan::cotan(mesh)?,
         Operator::MeshLaplace => mesh_laplace::mesh_laplace(mesh),
     };
+    assembled(edges, mass, bridges)
+}
+
+/// The triangles of the tufted cover, with the Laplacian that is half of the sum of theirs.
+pub(crate) fn tufted_cover(
+    mesh: &TriMesh,
+) -> Result<(Vec<IntrinsicFace>, Laplacian), LaplacianError> {
+    check(mesh, &[])?;
+    let cover = tufted::tufted(mesh);
+    let (edges, mass) = cover.weights(mesh.vertices.len());
+    Ok((cover.faces(), assembled(edges, mass, &[])?))
+}
+
+fn assembled(
+    mut edges: Vec<Edge>,
+    mass: Vec<f64>,
+    bridges: &[Bridge],
+) -> Result<Laplacian, LaplacianError> {
     if let Some((vertex, &mass)) = mass
         .iter()
         .enumerate()

@@ -45,17 +45,28 @@ impl Side {
 
 /// A closed intrinsic triangulation. For each side (three for each face) it holds the start vertex,
 /// the length, and the side on the other face. Glued sides run in opposite directions.
-struct Cover {
+pub(super) struct Cover {
     tails: Vec<u32>,
     lengths: Vec<f64>,
     glued: Vec<Side>,
 }
 
-/// Edge weights (all ≥ -1e-6) and vertex masses.
-pub(super) fn tufted(mesh: &TriMesh) -> (Vec<Edge>, Vec<f64>) {
+/// A triangle of the cover, which has no place in space: only lengths.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct IntrinsicFace {
+    /// Its vertices; one may come more than once.
+    pub(crate) corners: [u32; 3],
+    /// Where the corners lie in a plane of their own: at (0, 0), (x₁, 0) and (x₂, y₂), y₂ > 0.
+    pub(crate) x1: f64,
+    pub(crate) x2: f64,
+    pub(crate) y2: f64,
+}
+
+/// The flipped cover.
+pub(super) fn tufted(mesh: &TriMesh) -> Cover {
     let mut cover = Cover::new(mesh);
     cover.flip_to_delaunay();
-    cover.weights(mesh.vertices.len())
+    cover
 }
 
 /// The three edge lengths of each face, in the order of its sides, mollified.
@@ -274,7 +285,23 @@ impl Cover {
         }
     }
 
-    fn weights(&self, n_vertices: usize) -> (Vec<Edge>, Vec<f64>) {
+    /// The triangles; the Laplacian is half of the sum of theirs.
+    pub(super) fn faces(&self) -> Vec<IntrinsicFace> {
+        let face = |face: u32| {
+            let side = Side { face, side: 0 };
+            let (a, b, c) = self.face_lengths(side);
+            IntrinsicFace {
+                corners: std::array::from_fn(|s| self.tails[side.slot() + s]),
+                x1: a,
+                x2: (a * a + c * c - b * b) / (2.0 * a),
+                y2: 2.0 * area(a, b, c) / a,
+            }
+        };
+        (0..self.tails.len() as u32 / 3).map(face).collect()
+    }
+
+    /// Edge weights (all ≥ -1e-6) and vertex masses.
+    pub(super) fn weights(&self, n_vertices: usize) -> (Vec<Edge>, Vec<f64>) {
         let mut edges = Vec::with_capacity(self.tails.len());
         let mut mass = vec![0.0; n_vertices];
         for face in 0..self.tails.len() as u32 / 3 {

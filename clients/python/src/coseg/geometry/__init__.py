@@ -23,10 +23,11 @@ from coseg.geometry._blocks import (
     zoomout,
 )
 from coseg.geometry._description import Description
+from coseg.geometry._geodesics import Geodesics
 from coseg.geometry._maps import FunctionalMap, MapQuality, functional_map
 from coseg.geometry._mesh import Cleaned, Mesh, read_mesh
 from coseg.geometry._operators import Laplacian
-from coseg.geometry._picture import Picture
+from coseg._pixels import Picture
 from coseg.geometry._precise import PreciseMap
 from coseg.geometry._spectrum import Certificate, Spectrum, spectrum
 
@@ -35,6 +36,7 @@ __all__ = [
     "Cleaned",
     "Description",
     "FunctionalMap",
+    "Geodesics",
     "Laplacian",
     "MapQuality",
     "Mesh",

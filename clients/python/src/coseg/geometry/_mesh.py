@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,7 @@ from coseg.geometry._progress import Progress, reporter
 if TYPE_CHECKING:
     from coseg.geometry._description import Description
     from coseg.geometry._operators import Laplacian
-    from coseg.geometry._picture import Picture
+    from coseg._pixels import Picture
     from coseg.geometry._spectrum import Spectrum
 
 
@@ -200,6 +200,32 @@ class Mesh:
         """
         given = indices(np.atleast_1d(np.asarray(sources)), self.n_vertices, "sources", "vertices")
         return _native.edge_distances(self.vertices, self.faces, given, bridges)
+
+    def geodesics(
+        self,
+        sources: ArrayLike,
+        method: Literal["heat", "edges"] = "heat",
+        *,
+        time: float = 1.0,
+        progress: Progress = None,
+    ) -> Doubles:
+        """Distances along the surface from each vertex of ``sources`` (s,) to all vertices: (s, n).
+
+        In the unit of the coordinates: 0 at the source, never negative, infinite in other
+        components. ``min(axis=0)`` is the distance to the nearest source. ``"heat"`` is the heat
+        method (Crane, Weischedel and Wardetzky 2013) on the tufted Laplacian, within about 1 % of
+        the exact distance on even meshes; it works wherever :meth:`laplacian` does. Heat flows for
+        ``time`` squares of the mean edge: more is smoother, and less accurate. ``"edges"`` are
+        shortest paths along edges: see :meth:`edge_distances`. :class:`coseg.geometry.Geodesics`
+        keeps what the sources have in common for later calls.
+        """
+        from coseg.geometry._geodesics import Geodesics
+
+        if method == "edges":
+            return self.edge_distances(sources)
+        if method != "heat":
+            raise argument(f'method is {method!r}, but must be "heat" or "edges"')
+        return Geodesics(self, time=time).distances(sources, progress=progress)
 
     def plot(self, values: ArrayLike | None = None, *, backend: str | None = None) -> Any:
         """Shows the mesh, coloured by ``values`` (n,), (m,) or (n_polygons,).
