@@ -92,7 +92,7 @@ def test_pictures_show_the_mesh_and_its_values(tmp_path: Path) -> None:
 def test_notebooks_show_html() -> None:
     mesh = coseg.Mesh(*lumpy(2))
     s = mesh.spectrum(40)
-    for shown in (mesh, s, coseg.functional_map(s, s)):
+    for shown in (mesh, s, coseg.functional_map(s, s), mesh.laplacian(), mesh.describe()):
         html = shown._repr_html_()
         assert html.startswith('<div><img src="data:image/png;base64,iVBOR')
         assert len(html) < 200_000

@@ -61,7 +61,7 @@ def test_the_notebook_without_a_daemon_runs(animals: Path) -> None:
     shown = [
         o for cell in notebook.cells for o in cell.get("outputs", []) if "text/html" in o.get("data", {})
     ]
-    assert len(shown) == 3 and all("data:image/png" in o.data["text/html"] for o in shown)
+    assert len(shown) == 5 and all("data:image/png" in o.data["text/html"] for o in shown)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -219,6 +219,40 @@ def test_arrays_are_of_the_mesh_as_it_was_sent(coarse: coseg.Collection, meshes:
         chairs.hks(a, resolution="output")  # type: ignore[arg-type]
 
 
+def test_landmarks_are_vertices_of_either_mesh(coarse: coseg.Collection, meshes: list[Path]) -> None:
+    chairs, (a, b) = coarse, (meshes[0].stem, meshes[1].stem)
+    dense = chairs.map(a, b, points=True, resolution="proxy")
+    pairs = [(int(dense.p2p_21[v]), v) for v in (0, 100, 200)]
+    # Whatever the rows of the reply are of.
+    of_proxy = chairs.map(a, b, landmarks=pairs, landmark_resolution="proxy")
+    same = chairs.map(a, b, landmarks=pairs, resolution="proxy")
+    assert of_proxy.resolution == "input" and same.resolution == "proxy"
+    assert np.array_equal(of_proxy.c_12, same.c_12)
+    of_files = chairs.map(a, b, landmarks=pairs, resolution="proxy", landmark_resolution="input")
+    assert not np.array_equal(of_files.c_12, same.c_12)
+    n = coseg.read_mesh(meshes[0]).n_vertices
+    n_proxy = len(chairs.descriptors(a).vertices)
+    with pytest.raises(coseg.InvalidArgument, match=f"vertex {n - 1}.* has {n_proxy}"):
+        chairs.map(a, b, landmarks=[(n - 1, 0)], landmark_resolution="proxy")
+    ones = np.ones(n)
+    carried = chairs.transfer(ones, a, b, landmarks=pairs, resolution="input", landmark_resolution="proxy")
+    assert np.allclose(carried[~np.isnan(carried)], 1, atol=1e-5)
+    with pytest.raises(ValueError, match="landmark_resolution is 'input_faces'"):
+        chairs.map(a, b, landmarks=pairs, landmark_resolution="input_faces")  # type: ignore[arg-type]
+
+
+def test_a_map_of_faces_carries_values_of_faces(coarse: coseg.Collection, meshes: list[Path]) -> None:
+    chairs, (a, b) = coarse, (meshes[0].stem, meshes[1].stem)
+    labels, faces = chairs.labels(a), chairs.map(a, b, resolution="input_faces")
+    carried = faces.carry(labels)
+    assert len(carried) == len(chairs.labels(b)) and np.array_equal(carried, labels[faces.p2p_21])
+    n_vertices = coseg.read_mesh(meshes[0]).n_vertices
+    with pytest.raises(ValueError, match=f"values have {n_vertices} rows, .* one for each face of the mesh"):
+        faces.carry(np.zeros(n_vertices))
+    with pytest.raises(ValueError, match=f"values have {len(labels)} rows, .* one for each vertex of the mesh"):
+        chairs.map(a, b).carry(labels)
+
+
 def test_the_one_line_of_a_map(daemon: Daemon, meshes: list[Path]) -> None:
     with coseg.Library(daemon.endpoint) as lib:
         lib.collection("only", parts=4).submit(meshes[:2])

@@ -481,6 +481,7 @@ class Collection:
         k: int = 0,
         alternative: bool = False,
         resolution: t.Resolution = "input",
+        landmark_resolution: t.LandmarkResolution | None = None,
     ) -> t.FunctionalMap:
         """The functional map that carries functions on ``source`` to functions on ``target``, and the
         pointwise map, which goes the other way: from the vertices of one mesh as it was sent to those of
@@ -489,14 +490,15 @@ class Collection:
         By default it is the map by which labels are carried, which is kept; ``agreement`` says how it
         agrees with the other kept maps. With ``points``, or any option after it, it is made for points,
         now, in about 0.1 s, and its quality has the error to expect; ``landmarks`` are pairs of vertices
-        that correspond, of the meshes as they were sent (with ``resolution="proxy"`` of the working
-        meshes), ``orientation`` is ``"keep"`` or ``"reverse"`` (without:
-        the one that keeps it, unless that is much worse), ``k`` the size of ``c_12`` (without: 100), and
-        ``alternative`` asks for the best map of the other orientation too.
+        that correspond, of the meshes as they were sent (with ``landmark_resolution="proxy"``, or with
+        ``resolution="proxy"`` and no other word, of the working meshes), ``orientation`` is ``"keep"`` or
+        ``"reverse"`` (without: the one that keeps it, unless that is much worse), ``k`` the size of
+        ``c_12`` (without: 100), and ``alternative`` asks for the best map of the other orientation too.
         """
         # `from` is a word of the language.
         fields: dict[str, Any] = {"from": source, "to": target, "resolution": wire.resolution(resolution)}
-        asked = _point_options(landmarks, orientation, k, alternative, resolution)
+        of = landmark_resolution or ("proxy" if resolution == "proxy" else "input")
+        asked = _point_options(landmarks, orientation, k, alternative, of)
         if points or asked:
             fields["points"] = asked
         if agreement:
@@ -515,6 +517,7 @@ class Collection:
         orientation: str | None = None,
         k: int = 0,
         resolution: t.Resolution = "input_faces",
+        landmark_resolution: t.LandmarkResolution | None = None,
     ) -> np.ndarray[Any, Any]:
         """Carries values at the faces of ``source`` to those of ``target``, by a map between points:
         integers ``(n,)`` are voted on, numbers ``(n, …)`` averaged. With ``resolution="input"`` values are
@@ -522,7 +525,7 @@ class Collection:
         numbers are interpolated; with ``"proxy"`` at those of the working meshes. Other options are those
         of :meth:`map`."""
         options: dict[str, Any] = {"landmarks": landmarks, "orientation": orientation, "k": k}
-        options["resolution"] = resolution
+        options |= {"resolution": resolution, "landmark_resolution": landmark_resolution}
         return (self.transferred(values, source, target, **options)).values
 
     def transferred(
@@ -535,6 +538,7 @@ class Collection:
         orientation: str | None = None,
         k: int = 0,
         resolution: t.Resolution = "input_faces",
+        landmark_resolution: t.LandmarkResolution | None = None,
     ) -> t.Transferred:
         """What :meth:`transfer` gives, with the quality of the map."""
         rows = wire.resolution(resolution)
@@ -549,7 +553,8 @@ class Collection:
         else:
             ref = writer.array(array.astype(np.float32).reshape(len(array), -1))
         fields: dict[str, Any] = {"from": source, "to": target, "values": ref}
-        fields["points"] = asked = _point_options(landmarks, orientation, k, False, resolution)
+        of = landmark_resolution or ("proxy" if resolution == "proxy" else "input")
+        fields["points"] = asked = _point_options(landmarks, orientation, k, False, of)
         fields["resolution"] = rows
         reply, raw = self._call("transfer_function", writer.frames, **fields)
         # A daemon that is too old takes landmarks for vertices of the working meshes.
@@ -767,7 +772,7 @@ def _point_options(
     orientation: str | None,
     k: int,
     alternative: bool,
-    resolution: t.Resolution,
+    landmark_resolution: t.LandmarkResolution,
 ) -> dict[str, Any]:
     """What is asked of a map between points; nothing if all is as usual."""
     pairs = [{"from": int(source), "to": int(target)} for source, target in landmarks]
@@ -776,8 +781,7 @@ def _point_options(
         "orientation": wire.orientation(orientation),
         "k": k,
         "alternative": alternative,
-        # Of the working meshes where everything else is, too; else of the meshes as they were sent.
-        "landmark_resolution": wire.resolution("proxy" if resolution == "proxy" else "input") if pairs else 0,
+        "landmark_resolution": wire.landmark_resolution(landmark_resolution) if pairs else 0,
     }
     return {name: value for name, value in asked.items() if value}
 

@@ -419,6 +419,13 @@ def resolution(name: t.Resolution) -> int:
     return int(_value(analysis_pb2.Resolution, key, f"resolution is {name!r}"))
 
 
+def landmark_resolution(name: t.LandmarkResolution) -> int:
+    """Which vertices landmarks are: ``input`` or ``proxy``."""
+    if name not in ("input", "proxy"):
+        raise ValueError(f'landmark_resolution is {name!r}, but must be "input" or "proxy"')
+    return resolution(name)
+
+
 def resolution_name(value: int) -> t.Resolution:
     """Its name; the daemons that know none have rows of the proxy."""
     names: tuple[t.Resolution, ...] = ("proxy", "proxy", "input", "input_faces")

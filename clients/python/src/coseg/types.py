@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coseg import _html
+
 Int32 = NDArray[np.int32]
 UInt32 = NDArray[np.uint32]
 Float32 = NDArray[np.float32]
@@ -19,7 +21,9 @@ Element = TypeVar("Element", bound=np.generic)
 #: What the rows of an array are of: vertices of the mesh as it was sent, its faces, or vertices of the
 #: working mesh.
 Resolution = Literal["input", "input_faces", "proxy"]
-#: The same in words.
+#: Which vertices landmarks are: of the mesh as it was sent, or of the working mesh.
+LandmarkResolution = Literal["input", "proxy"]
+#: The rows in words.
 ROWS: Mapping[str, str] = {
     "input": "vertex of the mesh as it was sent",
     "input_faces": "face of the mesh as it was sent",
@@ -114,6 +118,9 @@ class CollectionInfo:
     #: Changes by a person that ``undo`` can take back.
     n_undoable: int = 0
 
+    def _repr_html_(self) -> str:
+        return _html.collection(self)
+
 
 @dataclass(frozen=True)
 class Updated:
@@ -180,6 +187,9 @@ class Shape:
     sources: tuple[Source, ...]
     review: Review
 
+    def _repr_html_(self) -> str:
+        return _html.shape(self)
+
 
 @dataclass(frozen=True)
 class Labelling:
@@ -190,6 +200,9 @@ class Labelling:
     labels: Int32
     #: (n_polygons,) probability of the label, if it was asked for.
     confidence: Float32 | None = None
+
+    def _repr_html_(self) -> str:
+        return _html.labelling(self)
 
 
 @dataclass(frozen=True)
@@ -292,6 +305,9 @@ class Spectrum:
     #: Surface area in squared input units.
     area: float
 
+    def _repr_html_(self) -> str:
+        return _html.spectrum(self)
+
 
 @dataclass(frozen=True)
 class Descriptors:
@@ -311,6 +327,9 @@ class Descriptors:
     polygon_area: Float32
     #: (g,) by which neighbours are ranked.
     signature: Float32
+
+    def _repr_html_(self) -> str:
+        return _html.descriptors(self)
 
 
 @dataclass(frozen=True)
@@ -404,6 +423,9 @@ class FunctionalMap:
             )
         carried: NDArray[Element] = array[self.p2p_21]
         return carried
+
+    def _repr_html_(self) -> str:
+        return _html.functional_map(self)
 
 
 @dataclass(frozen=True)

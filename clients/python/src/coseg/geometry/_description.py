@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coseg._pixels import Picture
 from coseg.geometry._arrays import Doubles, Indices, _native, argument
+from coseg.geometry._mesh import Mesh
 
 Singles = NDArray[np.float32]
 
@@ -69,3 +71,11 @@ class Description:
             f"Description({len(self.face_map)} polygons, proxy of {len(self.faces)} faces, "
             f"{len(self.eigenvalues)} eigenvalues, {self.face_descriptors.shape[1]} descriptors)"
         )
+
+    def picture(self, *, size: tuple[int, int] = (320, 320)) -> Picture:
+        """A picture of the proxy with its patches."""
+        mesh = Mesh(self.vertices.astype(np.float64), self.faces)
+        return mesh.picture(self.patches.astype(np.int32), size=size)
+
+    def _repr_html_(self) -> str:
+        return self.picture(size=(200, 200)).html(f"{self!r}; patches")

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from coseg.geometry._arrays import Doubles, Indices, _native, argument, indices, rows_of
 from coseg.geometry._blocks import precise, scale
 from coseg.geometry._mesh import Mesh, as_mesh
-from coseg.geometry._picture import Picture, beside, picture
+from coseg._pixels import Picture
+from coseg.geometry._picture import beside, picture
 from coseg.geometry._precise import PreciseMap
 from coseg.geometry._progress import Progress
 from coseg.geometry._spectrum import Spectrum

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coseg._pixels import Picture
 from coseg.geometry._arrays import Doubles
 
 if TYPE_CHECKING:
@@ -51,3 +52,10 @@ class Laplacian:
     def __repr__(self) -> str:
         n, entries = len(self.mass), len(self.values)
         return f"Laplacian({self.operator}, {n} x {n}, {entries} entries)"
+
+    def picture(self, *, size: tuple[int, int] = (320, 320)) -> Picture:
+        """A picture of the mesh, coloured by the logarithm of the mass at its vertices."""
+        return self.mesh.picture(np.log(self.mass), size=size)
+
+    def _repr_html_(self) -> str:
+        return self.picture(size=(200, 200)).html(f"{self!r}; mass")

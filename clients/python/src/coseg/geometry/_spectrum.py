@@ -15,7 +15,7 @@ from coseg.geometry._progress import Progress, reporter
 if TYPE_CHECKING:
     from coseg.geometry._mesh import Mesh
     from coseg.geometry._operators import Laplacian
-    from coseg.geometry._picture import Picture
+    from coseg._pixels import Picture
 
 
 @dataclass(frozen=True)
