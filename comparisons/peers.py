@@ -1,11 +1,12 @@
 """Times the tasks of docs/from-pyfm.md, from-lapy.md and from-robust-laplacian.md in both packages, in turn,
 in one run, and prints Markdown.
 
-    python comparisons/peers.py --meshes DIR [--rounds 3] [--k 300] [--large 0] [--tasks maps spectra]
+    python comparisons/peers.py --meshes DIR [--rounds 3] [--k 300] [--large 0] [--tasks maps spectra distances]
 
 DIR has pyFM's example: cat-00.off, lion-00.off, and lion2cat, which has for each vertex of the lion one of the cat. The
-peers are those of the Python package index: pyfmaps, lapy, robust_laplacian with scipy. All run in this process with
-their default threads. On a machine that does other work, --processor-time counts the processor time of all threads
+peers are those of the Python package index: pyfmaps, lapy, robust_laplacian with scipy, potpourri3d (whose heat method
+pyFM uses), pygeodesic (exact distances). All run in this process with their default threads, in turn. Seconds are
+medians; "times" is the median over the rounds of the peer's seconds by those of coseg in the same round. On a machine that does other work, --processor-time counts the processor time of all threads
 in the place of the clock. Errors are mean distances on the cat along edges, divided by the square root of its area. With
 --large N a map between spheres of about N vertices with lumps is timed too, spectra given.
 """
@@ -22,12 +23,15 @@ import numpy as np
 import coseg
 
 
+TASKS = ["maps", "spectra", "distances"]
+
+
 def arguments():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", required=True, type=Path)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--k", type=int, default=300)
-    parser.add_argument("--tasks", nargs="*", default=["maps", "spectra"], choices=["maps", "spectra"])
+    parser.add_argument("--tasks", nargs="*", default=TASKS, choices=TASKS)
     parser.add_argument("--processor-time", action="store_true", help="for a machine that does other work")
     parser.add_argument("--large", type=int, default=0, help="vertices")
     return parser.parse_args()
@@ -66,7 +70,7 @@ def robust(path, k):
 
 
 def alternate(tasks, rounds, clock):
-    """Median seconds and the last result of each task."""
+    """Seconds of each round and the last result of each task."""
     seconds, results = {name: [] for name in tasks}, {}
     for _ in range(rounds):
         for name, task in tasks.items():
@@ -74,13 +78,18 @@ def alternate(tasks, rounds, clock):
             with contextlib.redirect_stdout(io.StringIO()):
                 results[name] = task()
             seconds[name].append(clock() - begin)
-    return {name: statistics.median(s) for name, s in seconds.items()}, results
+    return seconds, results
 
 
-def table(seconds, notes):
-    print("\n| | seconds | |\n| --- | --- | --- |")
-    for name, s in seconds.items():
-        print(f"| {name} | {s:.2f} | {notes[name]} |")
+def table(seconds, notes, ours):
+    """`ours` names for each peer the task of coseg that does the same."""
+    print("\n| | seconds | times | |\n| --- | --- | --- | --- |")
+    for name, own in seconds.items():
+        ratio = ""
+        if name in ours:
+            rounds = zip(own, seconds[ours[name]], strict=True)
+            ratio = f"{statistics.median(theirs / best for theirs, best in rounds):.3g}"
+        print(f"| {name} | {statistics.median(own):.2f} | {ratio} | {notes[name]} |")
 
 
 def maps(args):
@@ -100,7 +109,8 @@ def maps(args):
         some = places[begin : begin + 200]
         distances[some] = mesh.edge_distances(some)
     error = {n: distances[truth, p].mean() / np.sqrt(mesh.area) for n, p in found.items()}
-    table(seconds, {n: f"error {e:.3f}" for n, e in error.items()})
+    *peers, own = tasks
+    table(seconds, {n: f"error {e:.3f}" for n, e in error.items()}, dict.fromkeys(peers, own))
 
 
 def spectra(args):
@@ -126,7 +136,31 @@ def spectra(args):
     for name, other in peer.items():
         apart = np.abs(found[name][1:] / found[other][1:] - 1).max()
         notes[name] = f"eigenvalues differ by at most {apart:.0e}"
-    table(seconds, notes)
+    table(seconds, notes, {names[0]: names[1], names[2]: names[3]})
+
+
+def distances(args):
+    import potpourri3d
+    from pygeodesic.geodesic import PyGeodesicAlgorithmExact
+
+    mesh = coseg.read_mesh(args.meshes / "cat-00.off")
+    sources = list(range(0, mesh.n_vertices, mesh.n_vertices // 10))[:10]
+
+    def potpourri():
+        solver = potpourri3d.MeshHeatMethodDistanceSolver(mesh.vertices, mesh.faces)
+        return np.stack([solver.compute_distance(s) for s in sources])
+
+    tasks = {
+        "potpourri3d: from 10 vertices, by heat": potpourri,
+        "coseg, by heat": lambda: mesh.geodesics(sources),
+        "coseg, along edges": lambda: mesh.geodesics(sources, method="edges"),
+    }
+    seconds, found = alternate(tasks, args.rounds, args.clock)
+    solver = PyGeodesicAlgorithmExact(mesh.vertices, mesh.faces.astype(np.int32))
+    exact = np.stack([solver.geodesicDistances(np.array([s]), None)[0] for s in sources])
+    off = {n: np.abs(d - exact).mean() / exact.mean() for n, d in found.items()}
+    peer, own, _ = tasks
+    table(seconds, {n: f"{o:.2%} from the exact ones" for n, o in off.items()}, {peer: own})
 
 
 def large(n, clock):
@@ -148,6 +182,12 @@ def large(n, clock):
 
     one, two = (lumpy(stretch) for stretch in (1.0, 1.2))
     begin = clock()
+    solver = coseg.geometry.Geodesics(one)
+    middle = clock()
+    solver.distances(range(8))
+    print(f"\n{one.n_vertices} vertices: distances prepared in {middle - begin:.2f} s, ", end="")
+    print(f"from 8 sources in {clock() - middle:.2f} s")
+    begin = clock()
     s, t = one.spectrum(100), two.spectrum(100)
     middle = clock()
     f = coseg.functional_map(s, t)
@@ -164,5 +204,7 @@ if __name__ == "__main__":
         maps(options)
     if "spectra" in options.tasks:
         spectra(options)
+    if "distances" in options.tasks:
+        distances(options)
     if options.large:
         large(options.large, options.clock)

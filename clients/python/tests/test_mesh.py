@@ -201,7 +201,8 @@ def test_geodesics_on_a_plane_are_straight() -> None:
     n = 60
     x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0)))
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
-    faces = np.concatenate([corner + [0, 1, n + 2], corner + [0, n + 2, n + 1]])
+    halves = np.array([[0, 1, n + 2], [0, n + 2, n + 1]])
+    faces = np.concatenate([corner + half for half in halves])
     plane = Mesh(np.stack([x, y, np.zeros_like(x)], axis=1), faces)
     for source in (0, n // 2 * (n + 2)):
         exact = np.hypot(x - x[source], y - y[source])
@@ -240,8 +241,8 @@ def test_geodesics_of_what_has_none() -> None:
     n = 3000
     at = np.arange(n + 1.0)
     ribbon = np.stack([np.tile(at, 2), np.repeat([0.0, 1.0], n + 1), np.zeros(2 * n + 2)], axis=1)
-    first = np.arange(n)[:, None]
-    long = Mesh(ribbon, np.concatenate([first + [0, 1, n + 2], first + [0, n + 2, n + 1]]))
+    first, halves = np.arange(n)[:, None], np.array([[0, 1, n + 2], [0, n + 2, n + 1]])
+    long = Mesh(ribbon, np.concatenate([first + half for half in halves]))
     with pytest.raises(coseg.GeometryError, match="give a time of 4 or more") as cold:
         long.geodesics(0)
     assert (cold.value.kind, cold.value.vertex is not None) == ("OutOfReach", True)

@@ -51,6 +51,7 @@ _Progress = Callable[[str, int, int], None] | None
 class HeatGeodesics:
     def __new__(cls, vertices: _F64, faces: _U32, time: float) -> HeatGeodesics: ...
     def distances(self, sources: _U32, progress: _Progress) -> _F64: ...
+
 @final
 class Shape:
     def __new__(

@@ -12,6 +12,7 @@ the same output on any number of threads. Long calls leave the interpreter to ot
 Ctrl-C ends them. Every error is a :class:`coseg.GeometryError` that names the face or vertex.
 """
 
+from coseg._pixels import Picture
 from coseg.geometry._blocks import (
     fit,
     functional,
@@ -27,7 +28,6 @@ from coseg.geometry._geodesics import Geodesics
 from coseg.geometry._maps import FunctionalMap, MapQuality, functional_map
 from coseg.geometry._mesh import Cleaned, Mesh, read_mesh
 from coseg.geometry._operators import Laplacian
-from coseg._pixels import Picture
 from coseg.geometry._precise import PreciseMap
 from coseg.geometry._spectrum import Certificate, Spectrum, spectrum
 

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coseg._pixels import Picture
 from coseg.geometry._arrays import Doubles, Indices, _native, argument, indices, rows_of
 from coseg.geometry._blocks import precise, scale
 from coseg.geometry._mesh import Mesh, as_mesh
-from coseg._pixels import Picture
 from coseg.geometry._picture import beside, picture
 from coseg.geometry._precise import PreciseMap
 from coseg.geometry._progress import Progress

@@ -25,9 +25,9 @@ from coseg.geometry._arrays import (
 from coseg.geometry._progress import Progress, reporter
 
 if TYPE_CHECKING:
+    from coseg._pixels import Picture
     from coseg.geometry._description import Description
     from coseg.geometry._operators import Laplacian
-    from coseg._pixels import Picture
     from coseg.geometry._spectrum import Spectrum
 
 

@@ -13,9 +13,9 @@ from coseg.geometry._arrays import Doubles, _native, argument, doubles, rows_of
 from coseg.geometry._progress import Progress, reporter
 
 if TYPE_CHECKING:
+    from coseg._pixels import Picture
     from coseg.geometry._mesh import Mesh
     from coseg.geometry._operators import Laplacian
-    from coseg._pixels import Picture
 
 
 @dataclass(frozen=True)
