@@ -44,7 +44,7 @@ class Asker {
           ...answer,
         };
         if (answer.skip || answer.cut_wrongly) await app.source.change("answer", body);
-        else await app.changes.send("answer", body);
+        else await app.changes.inTurn(() => app.changes.send("answer", body));
         await this.next();
       } finally {
         this.busy = false;
