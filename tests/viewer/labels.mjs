@@ -74,6 +74,7 @@ export async function labelTests({ test, open, shot, url }) {
         await page.keyboard.press("Enter");
       }
       await edited(page);
+      await toast(page, "“label");
       await page.waitForFunction(
         (id) => document.querySelector(`[data-label="${id}"] .text`)?.textContent === "arm <b>&",
         id,
@@ -81,7 +82,6 @@ export async function labelTests({ test, open, shot, url }) {
       isNamed("arm <b>&");
       assert.equal(await focus(page), "pencil", "the focus returns to the label");
       assert.ok(await page.isHidden("#effect"), "a name moves no label");
-      await toast(page, "“label");
       await backAndForth(
         page,
         "the name “arm <b>&”",
@@ -154,6 +154,7 @@ export async function labelTests({ test, open, shot, url }) {
         await page.keyboard.press("Enter");
       }
       await edited(page);
+      await toast(page, "“label");
       const merged = before.map(([name, of]) => [name, of.map((l) => (l === from ? into : l))]);
       const isMerged = () => {
         assert.deepEqual(everything(), merged);
@@ -167,7 +168,6 @@ export async function labelTests({ test, open, shot, url }) {
         n,
       );
       await shot(page, `merged-${way}`);
-      await toast(page, "“label");
       await backAndForth(page, "the merge of", isMerged, () =>
         assert.deepEqual(everything(), before),
       );
@@ -197,6 +197,7 @@ export async function labelTests({ test, open, shot, url }) {
         await page.keyboard.press("Enter");
       }
       await edited(page);
+      await toast(page, "A part of");
       const fresh = () => labels().filter((l) => !known.includes(l.id) && l.n_shapes > 0);
       const isSplit = () => {
         settled();
@@ -207,7 +208,6 @@ export async function labelTests({ test, open, shot, url }) {
       isSplit();
       const [{ id: made }] = fresh();
       await page.waitForSelector(pencil(made));
-      await toast(page, "A part of");
       await backAndForth(page, "the split of", isSplit, () =>
         assert.deepEqual(everything(), before),
       );

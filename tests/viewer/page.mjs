@@ -51,7 +51,10 @@ export function opener(browser, url) {
     const page = await context.newPage();
     page.setDefaultTimeout(Number(process.env.COSEG_VIEWER_PATIENCE_MS ?? 90_000));
     page.faults = [];
-    page.on("console", (message) => message.type() === "error" && page.faults.push(message.text()));
+    page.on("console", (message) => {
+      const { url: from } = message.location();
+      if (message.type() === "error") page.faults.push(`${message.text()} ${from}`);
+    });
     page.on("pageerror", (error) => page.faults.push(String(error)));
     page.on("dialog", (dialog) => dialog.accept());
     page.on("request", (request) => {

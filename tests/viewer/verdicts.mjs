@@ -186,7 +186,7 @@ export async function verdictTests({ test, open, shot, url, names }) {
         all.map((c) => [c.dataset.name, c.textContent]),
       );
       assert.ok(changed.includes(cards[0][0]), `${cards[0][0]} is the first`);
-      assert.match(cards[0][1], /% changed/);
+      assert.match(cards[0][1], /± (< )?[\d.]+ %/);
       const canvas = `.card[data-name="${suggested}"] canvas`;
       await page.locator(canvas).scrollIntoViewIfNeeded();
       await page.waitForSelector(`${canvas}[data-drawn]`);

@@ -147,8 +147,7 @@ class App {
     if (this.name) select.value = this.name;
     select.hidden = names.length === 0;
     const edit = this.source.live && library.edit;
-    for (const id of ["undo", "redo", "ask", "suggest", "approve", "doubtful"])
-      $(id).hidden = !edit;
+    for (const id of ["undo", "redo", "ask", "suggest"]) $(id).hidden = !edit;
     for (const mode of ["correct", "ask"])
       document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
     this.edit = edit;

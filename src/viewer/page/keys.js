@@ -27,13 +27,10 @@ class Keys {
     $("redo").onclick = () => app.changes.redo();
     $("ask").onclick = () => app.attempt(() => app.asker.next());
     $("suggest").onclick = () => app.actions.suggest();
-    $("approve").onclick = () => app.actions.approve();
-    $("doubtful").onclick = () => app.actions.doubt();
     $("help").onclick = () => $("keys").showModal();
     this.listenToTabs();
     document.addEventListener("keydown", (event) => this.key(event));
     window.addEventListener("popstate", () => app.attempt(() => app.follow()));
-    window.addEventListener("resize", () => app.gallery.redraw());
   }
 
   listenToTabs() {

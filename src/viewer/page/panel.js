@@ -35,6 +35,7 @@ class Panel {
       make("div", { className: "facts" },
         `${counted(shape.n_polygons, "face")} · labels version ${shape.version}${state}`),
       make("div", { className: "facts", id: "verdict" }, capital(verdictText(shape))),
+      app.edit ? this.verdicts() : "",
       ...sections,
     ));
     const [neighbours, events] = await Promise.all([
@@ -44,6 +45,26 @@ class Panel {
     if (ticket !== this.ticket) return;
     this.neighbours(near, neighbours);
     this.history(log, name, events);
+  }
+
+  /** Makes the buttons that give a verdict on the shape. */
+  verdicts() {
+    const { actions } = this.app;
+    const approve = make(
+      "button",
+      { id: "approve", title: "All labels of this shape are right (y)" },
+      make("kbd", { "aria-hidden": "true" }, "y"),
+      "Approve",
+    );
+    approve.onclick = () => actions.approve();
+    const doubtful = make(
+      "button",
+      { id: "doubtful", title: "Some labels of this shape are not right (u)" },
+      make("kbd", { "aria-hidden": "true" }, "u"),
+      "Doubtful",
+    );
+    doubtful.onclick = () => actions.doubt();
+    return make("div", { className: "give" }, approve, doubtful);
   }
 
   parts(shape) {

@@ -32,7 +32,10 @@ class Pointer {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
-    canvas.addEventListener("pointerup", () => this.release());
+    canvas.addEventListener("pointerup", (event) => {
+      this.release();
+      this.hover(event);
+    });
     canvas.addEventListener("pointercancel", () => this.release());
     canvas.addEventListener("pointerleave", () => this.hide());
     canvas.addEventListener("blur", () => this.hide());
@@ -70,7 +73,10 @@ class Pointer {
     this.at = { clientX: event.clientX, clientY: event.clientY };
     this.showCursor();
     if (!drag) return this.hover(event);
-    if (drag.paint) return void stage.painting.paint(event);
+    if (drag.paint) {
+      $("hint").hidden = true;
+      return void stage.painting.paint(event);
+    }
     const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
     [drag.x, drag.y] = [event.clientX, event.clientY];
     if (drag.shift) {

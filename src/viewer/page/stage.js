@@ -9,6 +9,9 @@ const MAX_SURFACE = 120_000;
  * (docs/maps.md).
  */
 const POOR_MAP = 0.75;
+/** Directions that are tried to show a part: so many around the shape. */
+const N_TURNS = 12;
+const TURN_ALL = 2 * Math.PI;
 /** Views that show labels. */
 const LABEL_VIEWS = ["labels", "history", "correct", "ask"];
 /** Share of its box that a shape fills. */
@@ -132,7 +135,7 @@ class Stage {
       this.present([{ mesh: proxy, caption: name }]);
     const surface = await app.surface(name);
     if (ticket !== this.ticket) return [];
-    const note = `${info.n_polygons} faces, as sent`;
+    const note = `${counted(info.n_polygons, "face")}, as sent`;
     return [{ mesh: new Mesh(surface, app.up), caption: name, note }];
   }
 
@@ -231,7 +234,28 @@ class Stage {
     this.resize();
     if (!this.fitted) this.fit();
     else if (!this.moved) this.fill();
+    this.faceQuestion();
     this.draw();
+  }
+
+  /** Turns the shape so that the part that the question is about can be seen, once for each. */
+  faceQuestion() {
+    const { question } = this.app.asker;
+    const { mesh } = this.scenes[0];
+    const asked = this.asked(mesh);
+    if (!asked || question.isFaced) return;
+    question.isFaced = true;
+    const seen = (yaw) => {
+      const view = Object.assign(new View(), { yaw, pitch: this.view.pitch });
+      return mesh.inFront(view, asked);
+    };
+    const yaws = Array.from({ length: N_TURNS }, (_, i) => this.view.yaw + (i / N_TURNS) * TURN_ALL);
+    const areas = yaws.map(seen);
+    const best = areas.indexOf(Math.max(...areas));
+    // A shape that shows the part well enough stays as the person has turned it.
+    if (areas[0] >= areas[best] / 2) return;
+    this.view.yaw = yaws[best];
+    this.fill();
   }
 
   /** Returns to the first view of a shape. */
