@@ -16,10 +16,10 @@ const GLANCE_MS = 900;
 const LOOK_MS = 1_800;
 /** A part with less of its area in one true part is cut wrongly. */
 const WHOLE = 0.7;
-/** Seconds after which she asks for no further question. */
-const ASK_UNTIL = 38;
+/** Number of questions that she answers. */
+const N_QUESTIONS = 6;
 /** Distance in pixels of the places where she looks at a shape. */
-const GRID = 14;
+const GRID = 22;
 
 const [url, out, folder] = process.argv.slice(2);
 const C = "vases";
@@ -28,7 +28,6 @@ const page = await opener(browser, url)(`${url}#${C}`, { width: 1280, height: 80
 const truth = new Truth(folder, C);
 const steps = [];
 let began = performance.now();
-const seconds = () => (performance.now() - began) / 1000;
 const think = (ms) => page.waitForTimeout(ms);
 
 /** Notes a step with a picture and the accuracy; the clock stands still meanwhile. */
@@ -141,8 +140,16 @@ async function correct() {
   const places = await wrongPlaces(shape);
   began += performance.now() - stopped;
   await think(LOOK_MS);
+  let fresh = null;
   for (const name of new Set(places.map((p) => p.right))) {
-    await press(`.palette button:has-text("${name}")`);
+    const button = page.locator(`.palette button:has-text("${name}")`);
+    if (await button.count()) await button.click();
+    else if (fresh) continue;
+    else {
+      const label = await page.getAttribute(".palette button:last-child", "data-label");
+      fresh = { name, label };
+      await press(".palette button:last-child");
+    }
     const here = places.filter((p) => p.right === name);
     for (const row of new Set(here.map((p) => p.y))) {
       const line = here.filter((p) => p.y === row);
@@ -159,6 +166,12 @@ async function correct() {
   await page.waitForSelector("#apply:disabled");
   await think(GLANCE_MS);
   await note("Enter", `${shape} is corrected`, true);
+  if (!fresh) return;
+  await press(`#legend [data-label="${fresh.label}"] .pencil`);
+  await page.keyboard.type(fresh.name, { delay: 60 });
+  await page.keyboard.press("Enter");
+  await page.waitForSelector("#editor", { state: "hidden" });
+  await note("pencil, name", `the new label is called ${fresh.name}`);
 }
 
 /** Looks at what the last change did. */
@@ -178,7 +191,7 @@ await sortLabels();
 await think(GLANCE_MS);
 await page.keyboard.press("q");
 await page.waitForSelector("#ask-name");
-for (let n = 0; seconds() < ASK_UNTIL; n++) await note(...(await answer()), n < 2);
+for (let n = 0; n < N_QUESTIONS; n++) await note(...(await answer()), n < 2);
 await correct();
 await compare();
 await page.keyboard.press("y");

@@ -103,6 +103,7 @@ class Asker {
     cut.onclick = () => this.answer({ cut_wrongly: true });
     box.replaceChildren(
       make("span", {}, `Which label does the bright part have? (${question.n_answered} answered)`),
+      question.isHidden ? make("span", { className: "quiet" }, "It is inside, out of sight.") : "",
       make("div", { className: "palette" }, ...buttons),
       make("label", {}, make("kbd", {}, "n"), name),
       names,

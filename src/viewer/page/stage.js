@@ -12,6 +12,8 @@ const POOR_MAP = 0.75;
 /** Directions that are tried to show a part: so many around the shape. */
 const N_TURNS = 12;
 const TURN_ALL = 2 * Math.PI;
+/** Tilts that are tried besides the present one: from above, into what is open, and from below. */
+const TILTS = [1.1, -0.7];
 /** Views that show labels. */
 const LABEL_VIEWS = ["labels", "history", "correct", "ask"];
 /** Share of its box that a shape fills. */
@@ -245,16 +247,16 @@ class Stage {
     const asked = this.asked(mesh);
     if (!asked || question.isFaced) return;
     question.isFaced = true;
-    const seen = (yaw) => {
-      const view = Object.assign(new View(), { yaw, pitch: this.view.pitch });
-      return mesh.inFront(view, asked);
-    };
-    const yaws = Array.from({ length: N_TURNS }, (_, i) => this.view.yaw + (i / N_TURNS) * TURN_ALL);
-    const areas = yaws.map(seen);
+    const { yaw, pitch } = this.view;
+    const ways = [pitch, ...TILTS].flatMap((tilt) =>
+      Array.from({ length: N_TURNS }, (_, i) =>
+        ({ yaw: yaw + (i / N_TURNS) * TURN_ALL, pitch: tilt })));
+    const areas = ways.map((way) => mesh.inFront(Object.assign(new View(), way), asked));
     const best = areas.indexOf(Math.max(...areas));
+    question.isHidden = areas[best] === 0;
     // A shape that shows the part well enough stays as the person has turned it.
     if (areas[0] >= areas[best] / 2) return;
-    this.view.yaw = yaws[best];
+    Object.assign(this.view, ways[best]);
     this.fill();
   }
 
