@@ -12,20 +12,32 @@ const FRAME: &str = include_str!("page/page.html");
 /// The viewer's styles.
 pub const STYLE: &str = include_str!("page/style.css");
 /// The viewer's scripts, in the order in which they use each other.
-const SCRIPTS: [&str; 13] = [
+const SCRIPTS: [&str; 25] = [
     include_str!("page/address.js"),
+    include_str!("page/settings.js"),
     include_str!("page/data.js"),
     include_str!("page/mesh.js"),
+    include_str!("page/pieces.js"),
     include_str!("page/draw.js"),
     include_str!("page/raster.js"),
     include_str!("page/gallery.js"),
+    include_str!("page/toasts.js"),
     include_str!("page/legend.js"),
-    include_str!("page/stage.js"),
+    include_str!("page/editor.js"),
     include_str!("page/strokes.js"),
+    include_str!("page/painting.js"),
+    include_str!("page/stage.js"),
+    include_str!("page/pointer.js"),
+    include_str!("page/painter.js"),
     include_str!("page/ask.js"),
     include_str!("page/changes.js"),
+    include_str!("page/verdicts.js"),
+    include_str!("page/actions.js"),
     include_str!("page/panel.js"),
+    include_str!("page/live.js"),
+    include_str!("page/keys.js"),
     include_str!("page/app.js"),
+    include_str!("page/main.js"),
 ];
 
 /// Returns the viewer's program.

@@ -320,6 +320,8 @@ struct Correct {
     shape: String,
     n_polygons: u64,
     runs: Vec<Run>,
+    #[serde(default)]
+    by: String,
 }
 
 #[derive(Deserialize)]
@@ -412,7 +414,11 @@ pub(super) async fn change(server: &Server, path: &str, sent: Reserved<Vec<u8>>)
                 label: change.label,
             };
             let (reply, _) = request!(server, SplitLabel(request))?;
-            json_of(server, move || json!({ "n_shapes": reply.n_shapes })).await
+            json_of(server, move || {
+                let label = reply.label.as_ref().map(json::label);
+                json!({ "label": label, "n_shapes": reply.n_shapes })
+            })
+            .await
         }
         "undo" => {
             let change = parsed::<Undo>(server, sent).await?.value;
@@ -483,7 +489,7 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
         collection: correction.collection,
         shape: correction.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
-        by: String::new(),
+        by: correction.by,
     };
     let (done, _) = request!(server, CorrectLabels(request), Some(frames))?;
     json_of(server, move || json::corrected(&done)).await

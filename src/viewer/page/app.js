@@ -1,7 +1,5 @@
 // The page as a whole: what is loaded, what is selected, what changed.
 
-/** Milliseconds between polls of a live library. */
-const LOOK_MS = 1_500;
 /** Okabe and Ito's colours, which the library gives to labels. */
 const OKABE_ITO = [
   [230, 159, 0],
@@ -13,6 +11,11 @@ const OKABE_ITO = [
   [204, 121, 167],
   [128, 128, 128],
 ];
+/** What the stage is, for those who do not see it. */
+const TURNED =
+  "The shape; drag or Shift and arrows turn it, scroll, + or − zooms";
+const PAINTED =
+  "The shape; arrows move the brush, Space paints, Shift and arrows turn it, + or − zooms";
 /** Colour of faces outside the selected label. */
 const DIMMED = [206, 210, 216];
 
@@ -25,13 +28,19 @@ class App {
     this.cache = new Map();
     this.thumbnails = new Thumbnails(this);
     this.changes = new Changes(this);
+    this.actions = new Actions(this);
+    this.verdicts = new Verdicts(this);
     this.asker = new Asker(this);
     this.gallery = new Gallery(this);
     this.stage = new Stage(this);
+    this.pointer = new Pointer(this);
+    this.painter = new Painter(this);
     this.panel = new Panel(this);
     this.legend = new Legend(this);
+    this.editor = new Editor(this);
+    this.live = new Live(this);
     this.view = readAddress("");
-    this.listen();
+    this.keys = new Keys(this);
   }
 
   shape(name) {
@@ -42,8 +51,12 @@ class App {
     return this.labels.get(label)?.rgb ?? OKABE_ITO[label] ?? UNLABELLED;
   }
 
-  /** Returns the colour of a label; grey if another label is selected. */
+  /**
+   * Returns the colour of a label; grey if another label is selected, or a change is to be seen
+   * before it is made.
+   */
   shownColour(label) {
+    if (this.preview) return this.preview.get(label) ?? DIMMED;
     return this.only === undefined || this.only === label ? this.colour(label) : DIMMED;
   }
 
@@ -74,6 +87,11 @@ class App {
   surface(name) {
     const version = this.shape(name).version;
     return this.cached(`surface ${name} ${version}`, () => this.source.surface(this.name, name));
+  }
+
+  /** Returns a surface with the labels of an older version, if it was loaded. */
+  surfaceAt(name, version) {
+    return this.cache.get(`surface ${name} ${version}`);
   }
 
   map(from, to) {
@@ -117,7 +135,7 @@ class App {
     } else {
       await this.follow();
     }
-    if (this.source.live) this.look();
+    if (this.source.live) this.live.look();
   }
 
   setLibrary(library) {
@@ -129,10 +147,11 @@ class App {
     if (this.name) select.value = this.name;
     select.hidden = names.length === 0;
     const edit = this.source.live && library.edit;
-    for (const id of ["undo", "redo", "ask", "suggest", "approve"]) $(id).hidden = !edit;
+    for (const id of ["undo", "redo", "ask", "suggest"]) $(id).hidden = !edit;
     for (const mode of ["correct", "ask"])
       document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
     this.edit = edit;
+    document.documentElement.toggleAttribute("data-edit", edit);
   }
 
   empty(title, text, command) {
@@ -146,6 +165,7 @@ class App {
   async load(name) {
     this.name = name;
     this.loaded = false;
+    this.editor.close();
     this.close();
     const ticket = (this.loading = {});
     [this.portraits, this.cache, this.log] = [new Map(), new Map(), []];
@@ -183,11 +203,9 @@ class App {
     this.byName = new Map(shapes.map((s) => [s.name, s]));
     this.labels = new Map(collection.labels.map((l) => [l.id, { ...l, rgb: rgb(l.colour) }]));
     this.legend.show();
+    this.editor.refresh();
     this.warnOfUp();
-    $("undo").disabled = !collection.n_undoable;
-    $("undo").title = collection.n_undoable
-      ? "Take back the newest change by a person"
-      : "Nothing to undo: nobody has changed anything";
+    this.changes.showButtons();
     this.filter();
     if (shapes.length === 0)
       this.empty(
@@ -195,7 +213,6 @@ class App {
         "Shapes appear here as they are labelled.",
         `coseg add meshes/ --collection ${collection.name}`,
       );
-    else this.empty();
   }
 
   /** Records when all visible pictures are drawn: milliseconds since the page was requested. */
@@ -217,10 +234,9 @@ class App {
     const names = (s) =>
       `${s.name} ${s.parts.map((p) => this.labelName(p.label)).join(" ")}`.toLowerCase();
     let found = this.shapes.filter((s) => words.every((w) => names(s).includes(w)));
-    if (this.only !== undefined)
-      found = found.filter((s) => s.parts.some((p) => p.label === this.only));
-    if (this.view.review)
-      found = found.filter((s) => (s.review?.state ?? "unseen") === this.view.review);
+    const only = this.editor.label ?? this.only;
+    if (only !== undefined) found = found.filter((s) => s.parts.some((p) => p.label === only));
+    if (this.view.review) found = found.filter((s) => stateOf(s) === this.view.review);
     const orders = {
       moved: (a, b) => this.changes.moved(b.name) - this.changes.moved(a.name),
       name: (a, b) => a.name.localeCompare(b.name, "en", { numeric: true }),
@@ -231,15 +247,14 @@ class App {
     if (order) found.sort((a, b) => order(a, b) || a.ordinal - b.ordinal);
     this.found = found;
     this.gallery.show(found);
+    this.verdicts.show();
     const all = this.nStored;
-    const approved = this.shapes.filter((s) => s.review?.state === "approved").length;
-    const verdicts = approved ? `, ${approved} approved` : "";
     $("count").textContent =
-      (found.length === all
-        ? counted(all, "shape")
-        : `${found.length} of ${counted(all, "shape")}`) + verdicts;
+      found.length === all ? counted(all, "shape") : `${found.length} of ${counted(all, "shape")}`;
     if (this.shapes.length && found.length === 0)
-      this.empty("Nothing found", "No shape has this name or label.");
+      this.empty("Nothing found", this.view.review
+        ? `No shape with this name or label is ${this.view.review}.`
+        : "No shape has this name or label.");
     else if (this.shapes.length) this.empty();
   }
 
@@ -287,10 +302,10 @@ class App {
     if (view.shape && !tab) Object.assign(view, { view: "labels", detail: null });
     const stays =
       view.collection === this.name && view.shape === this.selected && view.view === stage.mode;
-    if (stage.painted.size && !stays) {
+    if (stage.painting.size && !stays) {
       if (!confirm("Discard what is painted?"))
         return history.pushState(null, "", writeAddress(this.view));
-      stage.painted.clear();
+      stage.painting.forget();
     }
     this.view = view;
     history.replaceState(null, "", writeAddress(view));
@@ -303,7 +318,6 @@ class App {
     if (unknown) this.toast(`There is no collection “${unknown}” here.`, true);
     if (view.collection !== this.name) return this.load(view.collection);
     if (dims) this.legend.show();
-    $("review").value = view.review ?? "";
     const wanted = writeAddress({ ...view, collection: null, shape: null });
     if (wanted !== this.filtered) this.filter();
     if (dims) this.recolour();
@@ -372,7 +386,10 @@ class App {
       tab.setAttribute("aria-selected", String(chosen));
       tab.tabIndex = chosen ? 0 : -1;
     }
-    $("scene").classList.toggle("painting", this.stage.mode === "correct");
+    const paints = this.stage.mode === "correct";
+    $("scene").classList.toggle("painting", paints);
+    $("scene").setAttribute("aria-label", paints ? PAINTED : TURNED);
+    this.changes.showButtons();
   }
 
   close() {
@@ -393,237 +410,22 @@ class App {
       this.go({ shape: next.name, detail: this.stage.mode === "map" ? null : this.view.detail });
   }
 
-  async correct() {
-    const { stage } = this;
-    const shape = this.shape(this.selected);
-    const body = {
-      collection: this.name,
-      shape: shape.name,
-      n_polygons: shape.n_polygons,
-      runs: stage.runs(),
-    };
-    await this.attempt(async () => {
-      const done = await this.changes.send("correct", body);
-      stage.painted.clear();
-      this.toast(
-        `${percent(done.area_share)} of ${shape.name} is labelled by hand; ` +
-          `${followers(done, shape)}.`,
-      );
-      await this.reload();
-    });
-  }
+  // What other files do, under one name.
 
-  /** Approves all labels of the shape. */
-  approve() {
-    const shape = this.shape(this.selected);
-    if (!shape || !this.edit || this.stage.painted.size) return;
-    return this.attempt(async () => {
-      const body = { collection: this.name, shape: shape.name, state: "approved" };
-      const { corrected } = await this.changes.send("review", body);
-      this.toast(`${shape.name} is approved; ${followers(corrected, shape)}.`);
-      await this.reload();
-    });
-  }
-
-  /** Goes to the shape that is most worth labelling. */
-  suggest() {
-    if (!this.edit) return;
-    return this.attempt(async () => {
-      const { shape, reason } = await this.source.suggest(this.name);
-      await this.go({ shape, view: "correct", detail: null });
-      this.toast(`${shape}: ${reason}.`);
-    });
-  }
-
-  // A live library.
-
-  async attempt(work) {
-    try {
-      await work();
-    } catch (error) {
-      this.toast(error.message, true);
-    }
+  attempt(work) {
+    return attempt(work);
   }
 
   toast(text, bad = false) {
-    const toast = make("div", { className: bad ? "toast bad" : "toast" }, text);
-    // Above the shapes, so that it covers nothing that can be pressed.
-    const box = (
-      $("stage").hidden ? $("main") : document.querySelector(".scene")
-    ).getBoundingClientRect();
-    const room = {
-      left: box.left + 14,
-      bottom: window.innerHeight - Math.min(box.bottom, window.innerHeight) + 14,
-    };
-    for (const [side, pixels] of Object.entries(room))
-      $("toasts").style[side] = `${Math.round(pixels)}px`;
-    $("toasts").append(toast);
-    setTimeout(() => toast.remove(), bad ? 9_000 : 5_000);
+    showToast(text, bad);
   }
 
-  async look() {
-    try {
-      const library = await this.source.library();
-      this.setLibrary(library);
-      const names = library.collections.map((c) => c.name);
-      const mine = library.collections.find((c) => c.name === this.name);
-      const busy = [];
-      if (mine?.n_queued) busy.push(`${mine.n_queued} to place`);
-      if (mine?.n_stale) busy.push(`${mine.n_stale} to relabel`);
-      this.status(busy.join(" · ") || "live", busy.length ? "work" : "");
-      if (!mine && names.length) await this.go({ collection: names[0], shape: null });
-      else if (mine && this.loaded && this.differs(mine)) await this.reload();
-    } catch {
-      this.status("the daemon does not answer", "bad");
-    }
-    setTimeout(() => this.look(), LOOK_MS);
+  reload() {
+    return this.live.reload();
   }
-
-  status(text, kind) {
-    $("state").hidden = false;
-    $("state").textContent = text;
-    $("state").className = `pill ${kind}`;
-  }
-
-  differs(now) {
-    return ["sequence", "n_shapes", "n_stale", "n_undoable"].some(
-      (key) => now[key] !== this.about[key],
-    );
-  }
-
-  /** Loads what changed, and redraws only that. */
-  async reload() {
-    const found = await this.source.collection(this.name);
-    this.setCollection(found);
-    for (const name of this.portraits.keys())
-      if (!this.byName.has(name)) this.portraits.delete(name);
-    const changed = this.shapes
-      .filter((s) => this.portraits.get(s.name)?.version !== s.version)
-      .map((s) => s.name);
-    for (let i = 0; i < changed.length; i += 16)
-      for (const portrait of await this.source.portraitsOf(this.name, changed.slice(i, i + 16))) {
-        this.changes.replaced(this.portraits.get(portrait.name));
-        this.portraits.set(portrait.name, portrait);
-        this.gallery.draw(portrait.name, true);
-      }
-    await this.changes.show();
-    if (this.view.order === "moved") this.filter();
-    const { selected } = this;
-    if (!selected) return;
-    if (!this.byName.has(selected)) return this.go({ shape: null }, { replace: true });
-    this.panel.show(selected);
-    const shown = ["labels", "history", "correct", "ask"].includes(this.stage.mode);
-    if (changed.includes(selected) && shown && this.stage.painted.size === 0)
-      await this.stage.refresh();
-    else this.panel.showControls();
-  }
-
-  listen() {
-    $("search").oninput = () => this.go({ search: $("search").value }, { replace: true });
-    $("order").onchange = () => this.go({ order: $("order").value }, { replace: true });
-    $("collections").onchange = () =>
-      this.attempt(() =>
-        this.go({ collection: $("collections").value, shape: null, label: null, search: "" }),
-      );
-    $("close").onclick = () => this.go({ shape: null });
-    $("previous").onclick = () => this.step(-1);
-    $("next").onclick = () => this.step(1);
-    $("skip").onfocus = () =>
-      ($("skip").textContent = this.selected ? "Skip to the shape" : "Skip to the shapes");
-    $("skip").onclick = () =>
-      (this.selected ? this.tab() : this.gallery.root.querySelector(".card"))?.focus();
-    $("theme").onclick = () =>
-      setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
-    $("review").onchange = () => this.go({ review: $("review").value || null }, { replace: true });
-    $("undo").onclick = () => this.changes.undo();
-    $("redo").onclick = () => this.changes.redo();
-    $("ask").onclick = () => this.attempt(() => this.asker.next());
-    $("suggest").onclick = () => this.suggest();
-    $("approve").onclick = () => this.approve();
-    const tabs = [...document.querySelectorAll("[data-mode]")];
-    for (const tab of tabs) tab.onclick = () => this.go({ view: tab.dataset.mode, detail: null });
-    document.querySelector("[role=tablist]").onkeydown = (event) => {
-      const shown = tabs.filter((tab) => !tab.hidden);
-      const next = moved(shown.indexOf(event.target), shown.length, 1, event.key);
-      if (next === null) return;
-      event.preventDefault();
-      shown[next].focus();
-      shown[next].click();
-    };
-    document.addEventListener("keydown", (event) => this.key(event));
-    window.addEventListener("popstate", () => this.attempt(() => this.follow()));
-    window.addEventListener("resize", () => this.gallery.redraw());
-  }
-
-  /** Handles keys that mean the same wherever the focus is, except in fields. */
-  key(event) {
-    if (/INPUT|SELECT|TEXTAREA/.test(event.target.tagName) || event.defaultPrevented) return;
-    if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-      event.preventDefault();
-      return event.shiftKey ? this.changes.redo() : this.changes.undo();
-    }
-    if (event.ctrlKey || event.altKey || event.metaKey || event.shiftKey) return;
-    if (this.edit && this.loaded) {
-      if (event.key === "q") return this.attempt(() => this.asker.next());
-      if (event.key === "g") return this.suggest();
-      if (event.key === "v" && this.changes.newest) return this.changes.toggle();
-    }
-    if (!this.selected) return;
-    if (event.key === "Escape") $("close").click();
-    if (this.edit && event.key === "y") return this.approve();
-    if (this.stage.mode === "ask" && this.asker.key(event.key)) return event.preventDefault();
-    if (this.stage.mode === "correct" && this.panel.paintKey(event.key)) return;
-    if (event.target.closest("[role=tablist]")) return;
-    // Arrows move between cards only while no shape is open.
-    if (event.key === "ArrowLeft") this.step(-1);
-    if (event.key === "ArrowRight") this.step(1);
-  }
-}
-
-/**
- * Returns the number of other shapes that wait for a correction of this one. The shape may wait
- * itself.
- */
-function followers(done, shape) {
-  const n = done.n_stale - (done.n_faces < shape.n_polygons ? 1 : 0);
-  return `${counted(n, "other shape")} ${n === 1 ? "follows" : "follow"}`;
 }
 
 function rgb(text) {
   const n = parseInt(text.slice(1), 16);
   return [n >> 16, (n >> 8) & 255, n & 255];
-}
-
-function setTheme(theme, keep) {
-  document.documentElement.dataset.theme = theme;
-  try {
-    if (keep) localStorage.setItem("coseg-theme", theme);
-  } catch {
-    // A page that is a file may have no storage.
-  }
-}
-
-function wantedTheme() {
-  try {
-    const kept = localStorage.getItem("coseg-theme");
-    if (kept) return kept;
-  } catch {
-    // A page that is a file may have no storage.
-  }
-  return matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-}
-
-setTheme(wantedTheme(), false);
-const embedded = $("catalogue");
-try {
-  const app = new App(embedded ? new EmbeddedSource(embedded) : new LiveSource());
-  await app.start();
-} catch (error) {
-  $("empty").hidden = false;
-  $("empty").replaceChildren(
-    make("h2", {}, "The viewer cannot start"),
-    make("div", {}, error.message),
-  );
-  document.documentElement.dataset.ready = "failed";
-  throw error;
 }

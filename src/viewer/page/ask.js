@@ -14,12 +14,17 @@ class Asker {
     return this.question?.shape === shape;
   }
 
-  /** Fetches the next question and goes to its shape. */
-  async next() {
+  /**
+   * Fetches the next question and goes to its shape; with `stays`, only if the person has not left
+   * the questions meanwhile.
+   */
+  async next(stays = false) {
     const { app } = this;
     const question = await app.source.question(app.name);
+    if (stays && app.stage.mode !== "ask") return;
     this.question = { ...question, faces: new Set(question.faces) };
     if (app.selected === question.shape && app.stage.mode === "ask") {
+      app.stage.faceQuestion();
       app.stage.colour();
       app.stage.draw();
       app.panel.showControls();
@@ -44,8 +49,8 @@ class Asker {
           ...answer,
         };
         if (answer.skip || answer.cut_wrongly) await app.source.change("answer", body);
-        else await app.changes.send("answer", body);
-        await this.next();
+        else await app.changes.inTurn(() => app.changes.send("answer", body));
+        await this.next(true);
       } finally {
         this.busy = false;
       }
@@ -97,7 +102,8 @@ class Asker {
     const cut = make("button", { id: "ask-cut" }, make("kbd", {}, "x"), "Cut wrongly");
     cut.onclick = () => this.answer({ cut_wrongly: true });
     box.replaceChildren(
-      make("span", {}, `Which label has the bright part? (${question.n_answered} answered)`),
+      make("span", {}, `Which label does the bright part have? (${question.n_answered} answered)`),
+      question.isHidden ? make("span", { className: "quiet" }, "It is inside, out of sight.") : "",
       make("div", { className: "palette" }, ...buttons),
       make("label", {}, make("kbd", {}, "n"), name),
       names,

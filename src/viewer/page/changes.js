@@ -1,6 +1,9 @@
 // Changes that a person makes on this page: sends, undoes and repeats them, and shows their
 // progress.
 
+/** Paths of changes that record who made them. */
+const SIGNED = ["correct", "answer", "review"];
+
 class Changes {
   constructor(app) {
     this.app = app;
@@ -15,50 +18,100 @@ class Changes {
     this.shows = "after";
   }
 
+  /** Does one thing after the other, in the order in which a person asked for them. */
+  inTurn(work) {
+    const turn = (this.last ?? Promise.resolve()).then(work);
+    this.last = turn.catch(() => {});
+    return turn;
+  }
+
   /** Sends a change and records it. */
-  async send(path, body, redo = false) {
+  async send(path, body) {
+    const by = SIGNED.includes(path) ? { by: this.app.verdicts.reviewer } : {};
+    const change = { path, body: { ...body, ...by }, text: changeText(this.app, path, body) };
+    const done = await this.make(change);
+    this.undone = [];
+    return done;
+  }
+
+  async make(change) {
     const { app } = this;
     const since = app.about.sequence;
-    const done = await app.source.change(path, body);
-    this.made.push({ path, body });
-    if (!redo) this.undone = [];
-    this.newest = { since, portraits: new Map(), moved: new Map() };
-    this.shows = "after";
+    const done = await app.source.change(change.path, change.body);
+    change.created = createdLabel(change, done);
+    this.made.push(change);
+    this.begin(since, change, change.text);
     return done;
+  }
+
+  /** Begins to follow what a change moves. Names and doubts move nothing. */
+  begin(since, change, text) {
+    const moves = change?.path !== "name" && change?.body.state !== "doubtful";
+    this.newest = moves ? { since, text, portraits: new Map(), moved: new Map() } : null;
+    this.shows = "after";
   }
 
   /** Undoes a stroke that was not sent yet, or else the newest change by a person. */
   undo() {
     const { app } = this;
-    if (app.stage.mode === "correct" && app.stage.stroke(false)) return;
-    if (!app.edit || !app.about?.n_undoable) return;
-    return app.attempt(async () => {
+    if (app.stage.mode === "correct" && app.stage.painting.step(false)) return;
+    if (!app.edit) return;
+    return app.attempt(() => this.inTurn(async () => {
+      if (!app.about?.n_undoable) return;
       const since = app.about.sequence;
       const undone = await app.source.change("undo", { collection: app.name });
-      const made = this.made.pop();
-      if (made && isOf(made, undone)) this.undone.push(made);
-      else [this.made, this.undone] = [[], []];
-      this.newest = { since, portraits: new Map(), moved: new Map() };
-      const subject = undone.subject ? ` of ${undone.subject}` : "";
-      app.toast(
-        `Undone: ${undone.change}${subject}. ` +
-          `${counted(undone.n_left, "change")} before it can be undone.`,
-      );
+      let change = this.made.pop();
+      if (change && isOf(change, undone)) this.undone.push(change);
+      else [this.made, this.undone, change] = [[], [], null];
+      const text = change?.text ?? undoneText(app, undone);
+      this.begin(since, change, `taking back ${text}`);
+      const left = undone.n_left
+        ? `${counted(undone.n_left, "earlier change")} can be undone too.`
+        : "Nothing else can be undone.";
+      app.toast(`Undone: ${text}. ${left}`);
       await app.reload();
-    });
+    }));
   }
 
   /** Repeats the change that was undone last. */
   redo() {
     const { app } = this;
-    if (app.stage.mode === "correct" && app.stage.stroke(true)) return;
-    const made = this.undone.pop();
-    if (!made) return;
-    return app.attempt(async () => {
-      await this.send(made.path, made.body, true);
-      app.toast(`Done again: ${made.path}${made.body.shape ? ` of ${made.body.shape}` : ""}.`);
+    if (app.stage.mode === "correct" && app.stage.painting.step(true)) return;
+    return app.attempt(() => this.inTurn(async () => {
+      const change = this.undone.at(-1);
+      if (!change) return;
+      const was = change.created;
+      await this.make(change);
+      this.undone.pop();
+      // A label that is made again has another id.
+      if (was !== undefined)
+        for (const later of this.undone) replaceLabel(later.body, was, change.created);
+      app.toast(`Redone: ${change.text}.`);
       await app.reload();
-    });
+    }));
+  }
+
+  /** Says what Undo and Redo would do, and disables what does nothing. */
+  showButtons() {
+    const { app } = this;
+    const { strokes } = app.stage.painting;
+    const paints = app.stage.mode === "correct";
+    const n = app.about?.n_undoable ?? 0;
+    const stroke = paints && strokes.done.length > 0;
+    const newest = this.made.length > 0 && this.made.length <= n ? this.made.at(-1).text : null;
+    $("undo").disabled = !stroke && !n;
+    $("undo").title = stroke
+      ? "Take back the newest stroke (Ctrl+Z)"
+      : n
+        ? `Take back ${newest ?? "the newest change by a person"} (Ctrl+Z)`
+        : "Nothing to undo: nobody has changed anything";
+    const again = paints && strokes.undone.length > 0;
+    $("redo").disabled = !again && this.undone.length === 0;
+    $("redo").title = again
+      ? "Paint the stroke again that was taken back (Ctrl+Shift+Z)"
+      : this.undone.length
+        ? `Make ${this.undone.at(-1).text} again (Ctrl+Shift+Z)`
+        : "Nothing to redo: nothing was taken back on this page";
   }
 
   /** Records the portrait that a shape had before the newest change. */
@@ -81,32 +134,51 @@ class Changes {
   /** Shows the progress of the newest change. */
   async show() {
     const { app, newest } = this;
+    this.showButtons();
+    if (newest) {
+      const moved = new Map();
+      for (const e of await app.events()) {
+        if (e.kind !== "labels_changed" || e.sequence <= newest.since) continue;
+        const share = (e.moves ?? []).reduce((sum, m) => sum + m.area_share, 0);
+        moved.set(e.shape, Math.min((moved.get(e.shape) ?? 0) + share, 1));
+      }
+      newest.moved = moved;
+    }
+    if (newest === this.newest) this.showEffect();
+  }
+
+  showEffect() {
+    const { app, newest } = this;
     const box = $("effect");
-    $("redo").disabled = this.undone.length === 0;
     box.hidden = !newest;
     if (!newest) return;
-    newest.moved.clear();
-    for (const e of await app.events()) {
-      if (e.kind !== "labels_changed" || e.sequence <= newest.since) continue;
-      const share = (e.moves ?? []).reduce((sum, m) => sum + m.area_share, 0);
-      newest.moved.set(e.shape, Math.min(this.moved(e.shape) + share, 1));
-    }
-    const n = [...newest.moved.values()].filter((share) => share > 0).length;
-    const all =
-      [...newest.moved.values()].reduce((sum, share) => sum + share, 0) /
-      Math.max(app.shapes.length, 1);
+    const shares = [...newest.moved.values()].filter((share) => share > 0);
+    const all = shares.reduce((sum, share) => sum + share, 0) / Math.max(app.shapes.length, 1);
+    const n = counted(app.shapes.length, "shape");
     const waiting = app.about.n_stale;
+    const more = waiting ? `; ${counted(waiting, "shape")} still to come` : "";
+    const text = shares.length
+      ? `${capital(newest.text)} changed ${percent(all)} of all area, on ${shares.length} of ${n}`
+      : `${capital(newest.text)} changed no label`;
+    keepingFocus(box, () =>
+      box.replaceChildren(make("span", {}, `${text}${more}.`), ...this.effectButtons()),
+    );
+  }
+
+  effectButtons() {
+    const { app } = this;
+    const isFirst = app.view.order === "moved";
     const first = make(
       "button",
-      { id: "moved-first", "aria-pressed": String(app.view.order === "moved") },
+      { id: "moved-first", "aria-pressed": String(isFirst) },
       "Changed first",
     );
-    first.onclick = () =>
-      app.go({ order: app.view.order === "moved" ? "arrival" : "moved" }, { replace: true });
+    first.onclick = () => app.go({ order: isFirst ? "arrival" : "moved" }, { replace: true });
     const toggle = make(
       "button",
-      { id: "before", "aria-pressed": String(this.shows === "before") },
-      make("kbd", {}, "v"),
+      { id: "before", "aria-pressed": String(this.shows === "before"),
+        title: "Show the shapes as they were before (v)" },
+      make("kbd", { "aria-hidden": "true" }, "v"),
       "Before",
     );
     toggle.onclick = () => this.toggle();
@@ -118,17 +190,10 @@ class Changes {
     close.onclick = () => {
       this.newest = null;
       this.toggle("after");
+      app.gallery.describeAll();
       this.show();
     };
-    const wait = waiting ? `; ${counted(waiting, "shape")} to come` : "";
-    keepingFocus(box, () =>
-      box.replaceChildren(
-        `Your last change moved ${percent(all)} of the area, on ${counted(n, "shape")}${wait}. `,
-        first,
-        toggle,
-        close,
-      ),
-    );
+    return [first, toggle, close];
   }
 
   toggle(shows = this.shows === "before" ? "after" : "before") {
@@ -139,10 +204,46 @@ class Changes {
   }
 }
 
+/** Returns a noun for a change, with the names of the moment. */
+function changeText(app, path, body) {
+  const name = (label) => `“${app.labelName(label)}”`;
+  switch (path) {
+    case "correct": return `the correction of ${body.shape}`;
+    case "answer": return `the answer about ${body.shape}`;
+    case "review":
+      return `the ${body.state === "approved" ? "approval" : "doubt"} of ${body.shape}`;
+    case "name": return `the name “${body.name}”`;
+    case "merge": return `the merge of ${name(body.label)} into ${name(body.into)}`;
+    case "split": return `the split of ${name(body.label)}`;
+    default: return path;
+  }
+}
+
+/** Returns a noun for a change that was not made on this page. */
+function undoneText(app, { change, subject }) {
+  const known = { approve: "the approval", doubt: "the doubt", name: "the newest name of a label",
+    correct: "the correction", answer: "the answer", up: "the change of the up axis" }[change];
+  const label = app.labelName(Number(subject));
+  if (change === "merge" || change === "split") return `the ${change} of “${label}”`;
+  return `${known ?? change}${subject && change !== "up" ? ` of ${subject}` : ""}`;
+}
+
 /** Returns whether this change is the one that was undone in the library. */
-function isOf(made, undone) {
-  const kinds = { correct: ["correct"], answer: ["answer"], review: ["approve", "doubt"] }[
-    made.path
-  ] ?? [made.path];
-  return kinds.includes(undone.change) && (!made.body.shape || made.body.shape === undone.subject);
+function isOf({ path, body }, undone) {
+  const kind = path === "review" ? (body.state === "approved" ? "approve" : "doubt") : path;
+  const subject = body.shape ?? (path === "name" ? undone.subject : String(body.label));
+  return kind === undone.change && subject === undone.subject;
+}
+
+/** Returns the id of the label that a change made, if it may have made one. */
+function createdLabel({ path, body }, done) {
+  if (path === "split") return done.label.id;
+  if (path === "answer" && body.named) return done.label;
+  return undefined;
+}
+
+/** Replaces a label in the body of a change. */
+function replaceLabel(body, was, now) {
+  for (const key of ["label", "into"]) if (body[key] === was) body[key] = now;
+  for (const run of body.runs ?? []) if (run[2] === was) run[2] = now;
 }

@@ -165,6 +165,10 @@ class Gallery {
     this.cards = new Map();
     const near = { root: this.root, rootMargin: "150px" };
     this.sight = new IntersectionObserver((entries) => this.seen(entries), near);
+    // Cards have another size beside an open shape.
+    new ResizeObserver(() => {
+      for (const name of this.cards.keys()) this.draw(name);
+    }).observe(this.root);
     this.root.addEventListener("click", (event) => {
       const card = event.target.closest(".card");
       if (card) app.go({ shape: card.dataset.name, detail: null });
@@ -212,7 +216,9 @@ class Gallery {
         "span",
         { className: "foot" },
         make("span", { className: "name" }),
+        make("span", { className: "moved" }),
         make("span", { className: "mark" }),
+        make("span", { className: "signed" }),
       ),
     );
     this.cards.set(shape.name, card);
@@ -220,17 +226,32 @@ class Gallery {
     return card;
   }
 
+  /** Says on a card what is known of its shape. */
   describe(card, shape) {
-    const [name, mark] = card.querySelectorAll(".foot span");
+    const { app } = this;
+    const [name, share, mark, signed] = card.querySelectorAll(".foot > span");
     name.textContent = shown(shape.name);
-    card.title = `${shape.name}: ${shape.n_polygons} faces, ${shape.parts.length} parts`;
-    const doubt = certainty(shape) < 0.6;
-    const verdict = { approved: "✓ approved", doubtful: "? doubtful", corrected: "✎ corrected" }[
-      shape.review?.state
-    ];
-    mark.textContent = shape.stale ? "waiting" : verdict ?? (doubt ? "unsure" : "");
-    mark.classList.toggle("doubt", doubt && !shape.stale);
-    card.setAttribute("aria-current", String(this.app.selected === shape.name));
+    const state = stateOf(shape);
+    const doubt = state === "doubtful" || (state === "unseen" && certainty(shape) < 0.6);
+    const verdict = state === "unseen" ? (doubt ? "unsure" : "") : `${MARKS[state]} ${state}`;
+    mark.textContent = shape.stale ? "waiting" : verdict;
+    mark.className = `mark ${doubt && !shape.stale ? "doubt" : state}`;
+    mark.hidden = !mark.textContent;
+    const moved = app.changes.moved(shape.name);
+    share.textContent = moved ? `± ${percent(moved)}` : "";
+    share.title = moved ? "Share of its area that the last change moved" : "";
+    signed.textContent = state === "unseen" ? "" : shown(signature(shape.review));
+    signed.hidden = !signed.textContent;
+    const parts = `${counted(shape.n_polygons, "face")}, ${counted(shape.parts.length, "part")}`;
+    card.title = `${shape.name}: ${parts}; ${verdictText(shape)}`;
+    card.setAttribute("aria-current", String(app.selected === shape.name));
+  }
+
+  describeAll() {
+    for (const [name, card] of this.cards) {
+      const shape = this.app.shape(name);
+      if (shape) this.describe(card, shape);
+    }
   }
 
   seen(entries) {

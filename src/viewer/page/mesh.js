@@ -3,6 +3,8 @@
 /** Faces that meet at less than this angle share their normals. */
 const CREASE = Math.cos((38 * Math.PI) / 180);
 const UNLABELLED = [150, 150, 150];
+/** Rows and columns of the coarse picture that tells what is in front. */
+const FRONT_CELLS = 28;
 
 const AXES = {
   "+x": [1, 0, 0],
@@ -205,6 +207,24 @@ class Mesh {
       best = { face: f, depth, point };
     }
     return best;
+  }
+
+  /**
+   * Returns how many places of a coarse picture have a face in front that `of` accepts, judged by
+   * the centres of faces.
+   */
+  inFront(view, of) {
+    view.box = [0, 0, FRONT_CELLS, FRONT_CELLS];
+    const centres = new Float32Array(3 * this.nFaces);
+    for (let f = 0; f < this.nFaces; f++) centres.set(this.centre(f), 3 * f);
+    const screen = view.project(centres);
+    const front = new Map();
+    for (let f = 0; f < this.nFaces; f++) {
+      const cell = FRONT_CELLS * Math.floor(screen[3 * f + 1]) + Math.floor(screen[3 * f]);
+      const now = front.get(cell);
+      if (now === undefined || screen[3 * f + 2] > screen[3 * now + 2]) front.set(cell, f);
+    }
+    return [...front.values()].filter(of).length;
   }
 
   /** Returns the faces that are connected with one, across sides that `over` accepts. */

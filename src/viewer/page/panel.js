@@ -34,7 +34,8 @@ class Panel {
       make("h2", {}, name),
       make("div", { className: "facts" },
         `${counted(shape.n_polygons, "face")} · labels version ${shape.version}${state}`),
-      make("div", { className: "facts", id: "verdict" }, verdictText(shape.review)),
+      make("div", { className: "facts", id: "verdict" }, capital(verdictText(shape))),
+      app.edit ? this.verdicts() : "",
       ...sections,
     ));
     const [neighbours, events] = await Promise.all([
@@ -44,6 +45,26 @@ class Panel {
     if (ticket !== this.ticket) return;
     this.neighbours(near, neighbours);
     this.history(log, name, events);
+  }
+
+  /** Makes the buttons that give a verdict on the shape. */
+  verdicts() {
+    const { actions } = this.app;
+    const approve = make(
+      "button",
+      { id: "approve", title: "All labels of this shape are right (y)" },
+      make("kbd", { "aria-hidden": "true" }, "y"),
+      "Approve",
+    );
+    approve.onclick = () => actions.approve();
+    const doubtful = make(
+      "button",
+      { id: "doubtful", title: "Some labels of this shape are not right (u)" },
+      make("kbd", { "aria-hidden": "true" }, "u"),
+      "Doubtful",
+    );
+    doubtful.onclick = () => actions.doubt();
+    return make("div", { className: "give" }, approve, doubtful);
   }
 
   parts(shape) {
@@ -70,7 +91,7 @@ class Panel {
       const unlit = () => app.stage.setHighlight(pressed?.highlight ?? null);
       [row.onmouseenter, row.onfocus, row.onmouseleave, row.onblur] = [lit, lit, unlit, unlit];
       row.onclick = () => {
-        if (app.stage.mode === "correct") return app.stage.paintPart(highlight);
+        if (app.stage.mode === "correct") return app.stage.painting.paintPart(highlight);
         pressed?.row.setAttribute("aria-pressed", "false");
         pressed = pressed?.row === row ? null : { row, highlight };
         pressed?.row.setAttribute("aria-pressed", "true");
@@ -149,7 +170,7 @@ class Panel {
         make("span", { className: "quiet" }, "little to much heat left"),
       );
     else if (stage.mode === "map") this.mapControls(box);
-    else if (stage.mode === "correct") this.paintControls(box);
+    else if (stage.mode === "correct") app.painter.controls(box);
     else if (stage.mode === "ask") app.asker.controls(box);
     else
       box.replaceChildren(
@@ -217,99 +238,6 @@ class Panel {
         ...facts.flatMap(([k, v]) => [make("span", {}, k), make("b", {}, v)]),
       ),
     );
-  }
-
-  paintControls(box) {
-    const { stage } = this.app;
-    const { brush } = stage;
-    const ids = this.app.labelsInUse().map((l) => l.id);
-    const fresh = Math.max(-1, ...this.app.labels.keys()) + 1;
-    brush.label ??= ids[0] ?? fresh;
-    const choose = (label) => {
-      brush.label = label;
-      this.showControls();
-    };
-    const all = [...ids, fresh];
-    this.choices = all;
-    const entry = (label, text) => {
-      const at = all.indexOf(label);
-      const key = at < 9 ? { "data-key": at + 1 } : {};
-      const button = make(
-        "button",
-        { "aria-pressed": String(brush.label === label), "data-label": label, ...key },
-        swatch(this.app.colour(label)),
-        text,
-      );
-      button.onclick = () => choose(label);
-      return button;
-    };
-    const tool = make(
-      "select",
-      { "aria-label": "Tool" },
-      make("option", { value: "brush" }, "Brush (b)"),
-      make("option", { value: "part" }, "Fill a part (f)"),
-      make("option", { value: "eraser" }, "Eraser (e)"),
-    );
-    tool.value = brush.tool;
-    tool.onchange = () => {
-      brush.tool = tool.value;
-      size.disabled = brush.tool === "part";
-    };
-    const size = make("input", {
-      type: "range",
-      min: 0.02,
-      max: 0.5,
-      step: 0.01,
-      value: brush.size,
-      disabled: brush.tool === "part",
-      "aria-label": "Size of the brush",
-    });
-    size.oninput = () => (brush.size = Number(size.value));
-    size.style.width = "90px";
-    this.apply = make("button", { className: "primary", id: "apply" }, "Apply");
-    this.apply.onclick = () => this.app.correct();
-    this.discard = make("button", { id: "discard" }, "Discard");
-    this.discard.onclick = () => stage.discard();
-    this.amount = make("span", { className: "quiet" });
-    box.replaceChildren(
-      tool,
-      size,
-      make(
-        "div",
-        { className: "palette" },
-        ...ids.map((id) => entry(id, this.app.labelName(id))),
-        entry(fresh, "new label"),
-      ),
-      make("span", { className: "ends" }, this.amount, this.discard, this.apply),
-    );
-    $("scene").classList.add("painting");
-    this.paintedChanged();
-  }
-
-  /** Handles a key for painting; returns whether it has a meaning here. */
-  paintKey(key) {
-    const { stage } = this.app;
-    const { brush } = stage;
-    const tool = { b: "brush", f: "part", e: "eraser" }[key];
-    const label = /^[1-9]$/.test(key) ? this.choices?.[Number(key) - 1] : undefined;
-    const size = { "[": 1 / 1.25, "]": 1.25 }[key];
-    if (tool) brush.tool = tool;
-    else if (label !== undefined) brush.label = label;
-    else if (size) brush.size = Math.min(Math.max(brush.size * size, 0.02), 0.5);
-    else if (key === "Enter" && stage.painted.size && document.activeElement === stage.canvas)
-      this.app.correct();
-    else return false;
-    this.showControls();
-    return true;
-  }
-
-  paintedChanged() {
-    const n = this.app.stage.painted.size;
-    if (!this.apply) return;
-    this.apply.disabled = this.discard.disabled = n === 0;
-    this.amount.textContent = n
-      ? `${counted(n, "face")} painted`
-      : "paint on the shape, or press its parts in the list; drag beside it to turn";
   }
 }
 
@@ -382,14 +310,6 @@ function labelEvent(e, app) {
     default:
       return null;
   }
-}
-
-/** Returns the text of a person's verdict, with name and time. */
-function verdictText(review) {
-  if (!review || review.state === "unseen") return "nobody has given a verdict";
-  const by = review.by ? ` by ${review.by}` : "";
-  const at = review.unix_ms ? `, ${new Date(review.unix_ms).toLocaleString()}` : "";
-  return `${review.state}${by}${at}`;
 }
 
 function meshText(shape) {

@@ -1,4 +1,4 @@
-// Shows one shape, large: rotates it, colours it, and lets a person correct it.
+// Shows one shape, large, in the colours of a view.
 
 /** Maximum number of triangles of a sent mesh that is shown instead of the proxy. */
 const MAX_SURFACE = 120_000;
@@ -9,6 +9,13 @@ const MAX_SURFACE = 120_000;
  * (docs/maps.md).
  */
 const POOR_MAP = 0.75;
+/** Directions that are tried to show a part: so many around the shape. */
+const N_TURNS = 12;
+const TURN_ALL = 2 * Math.PI;
+/** Tilts that are tried besides the present one: from above, into what is open, and from below. */
+const TILTS = [1.1, -0.7];
+/** Views that show labels. */
+const LABEL_VIEWS = ["labels", "history", "correct", "ask"];
 /** Share of its box that a shape fills. */
 const ROOM = 0.88;
 
@@ -21,8 +28,7 @@ class Stage {
     this.eigen = 0;
     this.time = null;
     this.transferred = "labels";
-    this.brush = { label: null, size: 0.1, tool: "brush" };
-    this.painted = new Strokes();
+    this.painting = new Painting(this);
     this.listen();
   }
 
@@ -33,7 +39,7 @@ class Stage {
   /** Shows a shape in its first view. Resolves when everything that the mode needs is drawn. */
   async show(name) {
     this.name = name;
-    this.painted.clear();
+    this.painting.forget();
     this.highlight = null;
     this.fitted = false;
     await this.refresh();
@@ -102,46 +108,48 @@ class Stage {
   }
 
   async build(mode, name, portrait, ticket) {
-    const { app } = this;
-    const proxy = new Mesh(portrait, app.up);
-    const before = app.changes.before(name);
-    if (before && mode === "labels")
-      return [{ mesh: new Mesh(before, app.up), caption: name, note: "before the last change" }];
-    if (mode === "labels" || mode === "history" || mode === "correct" || mode === "ask") {
-      const info = app.shape(name);
-      const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
-      if (!fine && mode === "correct")
-        throw new Error(
-          `With ${info.n_polygons} faces this shape is corrected with “coseg correct”.`,
-        );
-      if (!fine && mode === "ask")
-        throw new Error(
-          `With ${info.n_polygons} faces this shape is asked about with “coseg ask --png FILE”.`,
-        );
-      if (!fine) return [{ mesh: proxy, caption: name, note: this.resolution(portrait, info) }];
-      // The proxy appears at once, the sent mesh as soon as it is loaded.
-      if (!this.scenes?.some((s) => s.mesh.portrait.name === name))
-        this.present([{ mesh: proxy, caption: name }]);
-      const surface = await app.surface(name);
-      if (ticket !== this.ticket) return [];
-      return [
-        {
-          mesh: new Mesh(surface, app.up),
-          caption: name,
-          note: `${info.n_polygons} faces, as sent`,
-        },
-      ];
-    }
+    if (LABEL_VIEWS.includes(mode)) return this.buildLabels(name, portrait, ticket);
+    const proxy = new Mesh(portrait, this.app.up);
     if (mode === "map") return this.buildMap(name, proxy);
-    const functions = await app.functions(name);
-    this.functions = functions;
-    const scene = { mesh: proxy, caption: name };
+    return [await this.buildFunction(mode, name, proxy)];
+  }
+
+  async buildLabels(name, portrait, ticket) {
+    const { app, mode } = this;
+    const before = this.painting.size === 0 && app.changes.before(name);
+    if (before) {
+      const surface = await app.surfaceAt(name, before.version);
+      const mesh = new Mesh(surface ?? before, app.up);
+      return [{ mesh, caption: name, note: "before the last change" }];
+    }
+    const info = app.shape(name);
+    const proxy = new Mesh(portrait, app.up);
+    const fine = app.source.live && info.n_polygons <= MAX_SURFACE;
+    const otherwise = {
+      correct: "is corrected with “coseg correct”",
+      ask: "is asked about with “coseg ask --png FILE”",
+    }[mode];
+    if (!fine && otherwise)
+      throw new Error(`With ${info.n_polygons} faces this shape ${otherwise}.`);
+    if (!fine) return [{ mesh: proxy, caption: name, note: this.resolution(portrait, info) }];
+    // The proxy appears at once, the sent mesh as soon as it is loaded.
+    if (!this.scenes?.some((s) => s.mesh.portrait.name === name))
+      this.present([{ mesh: proxy, caption: name }]);
+    const surface = await app.surface(name);
+    if (ticket !== this.ticket) return [];
+    const note = `${counted(info.n_polygons, "face")}, as sent`;
+    return [{ mesh: new Mesh(surface, app.up), caption: name, note }];
+  }
+
+  async buildFunction(mode, name, mesh) {
+    const functions = (this.functions = await this.app.functions(name));
+    const scene = { mesh, caption: name };
     if (mode === "eigen") {
       this.eigen = Math.min(this.eigen, functions.eigenvalues.length - 1);
       const values = column(functions.eigenvectors, this.eigen);
       const largest = values.reduce((m, v) => Math.max(m, Math.abs(v)), 1e-12);
       scene.values = values.map((v) => v / largest);
-      scene.colours = vertexColours(proxy, (v) => shade(DIVERGING, 0.5 + scene.values[v] / 2));
+      scene.colours = vertexColours(mesh, (v) => shade(DIVERGING, 0.5 + scene.values[v] / 2));
       scene.contours = 5;
       scene.note = `eigenfunction ${this.eigen + 1}`;
     } else {
@@ -153,10 +161,10 @@ class Stage {
       const sorted = Float32Array.from(values).sort();
       const [low, high] = [sorted[0], sorted[Math.floor(0.98 * (sorted.length - 1))]];
       scene.values = values.map((v) => (v - low) / (high - low || 1));
-      scene.colours = vertexColours(proxy, (v) => shade(SEQUENTIAL, scene.values[v]));
+      scene.colours = vertexColours(mesh, (v) => shade(SEQUENTIAL, scene.values[v]));
       scene.note = `heat kernel signature at t = ${functions.times[this.time].toPrecision(3)}`;
     }
-    return [scene];
+    return scene;
   }
 
   async buildMap(name, proxy) {
@@ -228,7 +236,28 @@ class Stage {
     this.resize();
     if (!this.fitted) this.fit();
     else if (!this.moved) this.fill();
+    this.faceQuestion();
     this.draw();
+  }
+
+  /** Turns the shape so that the part that the question is about can be seen, once for each. */
+  faceQuestion() {
+    const { question } = this.app.asker;
+    const { mesh } = this.scenes[0];
+    const asked = this.asked(mesh);
+    if (!asked || question.isFaced) return;
+    question.isFaced = true;
+    const { yaw, pitch } = this.view;
+    const ways = [pitch, ...TILTS].flatMap((tilt) =>
+      Array.from({ length: N_TURNS }, (_, i) =>
+        ({ yaw: yaw + (i / N_TURNS) * TURN_ALL, pitch: tilt })));
+    const areas = ways.map((way) => mesh.inFront(Object.assign(new View(), way), asked));
+    const best = areas.indexOf(Math.max(...areas));
+    question.isHidden = areas[best] === 0;
+    // A shape that shows the part well enough stays as the person has turned it.
+    if (areas[0] >= areas[best] / 2) return;
+    Object.assign(this.view, ways[best]);
+    this.fill();
   }
 
   /** Returns to the first view of a shape. */
@@ -254,12 +283,6 @@ class Stage {
     this.view.pan = [x * room, y * room - 2 * Math.max(taken - (1 - room) / 2, 0)];
   }
 
-  /** Returns the label of each face, including painted labels. */
-  paintedLabels(mesh) {
-    if (this.painted.size === 0 || !mesh.polygons) return mesh.labels;
-    return mesh.labels.map((label, f) => this.painted.labels.get(mesh.polygons[f]) ?? label);
-  }
-
   colour() {
     const { app, renderer, highlight } = this;
     for (const { mesh, uploaded, colours, plain, values } of this.scenes) {
@@ -269,7 +292,7 @@ class Stage {
           renderer.update(uploaded, "border", new Uint8Array(4 * uploaded.nCorners).fill(255));
         continue;
       }
-      const labels = this.paintedLabels(mesh);
+      const labels = this.painting.labelsOf(mesh);
       const dim = (c) => c.map((x) => 0.2 * x + 0.8 * 178);
       const lit = this.asked(mesh) ?? this.highlighted(mesh, highlight);
       const of = (f) => {
@@ -355,75 +378,11 @@ class Stage {
   }
 
   listen() {
-    const { canvas, view } = this;
-    let drag = null;
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      const shift = event.shiftKey || event.button === 2;
-      if (this.mode === "correct") this.painted.begin();
-      const paint = this.mode === "correct" && !shift && !event.altKey && this.paint(event);
-      drag = { x: event.clientX, y: event.clientY, shift, paint };
-      if (!paint) this.painted.open = null;
-      if (!paint) canvas.classList.add("turning");
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      this.moveCursor(event);
-      if (!drag) return this.hover(event);
-      if (drag.paint) return void this.paint(event);
-      const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
-      [drag.x, drag.y] = [event.clientX, event.clientY];
-      if (drag.shift) {
-        this.moved = true;
-        view.pan[0] += (2 * dx * this.scenes.length) / canvas.clientWidth;
-        view.pan[1] -= (2 * dy) / canvas.clientHeight;
-      } else {
-        view.yaw -= dx * 0.009;
-        view.pitch = Math.min(Math.max(view.pitch + dy * 0.009, -1.5), 1.5);
-      }
-      this.draw();
-    });
-    const end = () => {
-      if (drag?.paint) this.painted.end();
-      drag = null;
-      this.app.panel.paintedChanged();
-      canvas.classList.remove("turning");
-    };
-    canvas.addEventListener("pointerup", end);
-    canvas.addEventListener("pointercancel", end);
-    canvas.addEventListener("pointerleave", () => ($("hint").hidden = $("cursor").hidden = true));
-    canvas.addEventListener("dblclick", () => {
-      if (this.mode === "correct" || !this.scenes?.length) return;
-      this.fit();
-      this.draw();
-    });
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(Math.exp(-event.deltaY * 0.0012));
-    }, { passive: false });
-    canvas.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.altKey || event.metaKey || !this.scenes?.length) return;
-      const zoom = { "+": 1.15, "=": 1.15, "-": 1 / 1.15 }[event.key];
-      if (zoom) return this.zoom(zoom);
-      if (event.key === "0") {
-        this.fit();
-        return this.draw();
-      }
-      const arrow =
-        event.shiftKey && event.key.startsWith("Arrow") ? event.key.slice(5) : event.key;
-      const step = { a: [-0.15, 0], d: [0.15, 0], w: [0, 0.1], s: [0, -0.1],
-        Left: [-0.15, 0], Right: [0.15, 0], Up: [0, 0.1], Down: [0, -0.1] }[arrow];
-      if (!step) return;
-      event.preventDefault();
-      view.yaw += step[0];
-      view.pitch = Math.min(Math.max(view.pitch + step[1], -1.5), 1.5);
-      this.draw();
-    });
     new ResizeObserver(() => {
       this.resize();
       if (this.scenes?.length && !this.moved) this.fill();
       this.draw();
-    }).observe(canvas);
+    }).observe(this.canvas);
   }
 
   zoom(factor) {
@@ -433,160 +392,4 @@ class Stage {
     view.pan = view.pan.map((p) => p * factor);
     this.draw();
   }
-
-  /** Shows the size of the brush at the pointer. */
-  moveCursor(event) {
-    const cursor = $("cursor");
-    const shown = this.mode === "correct" && this.brush.tool !== "part" && this.pick(event);
-    cursor.hidden = !shown;
-    if (!shown) return;
-    const box = this.canvas.getBoundingClientRect();
-    // The same factor as in View.scale.
-    const pixels = 0.9 * this.reach() * this.view.zoom * Math.min(box.width, box.height);
-    Object.assign(cursor.style, {
-      left: `${event.clientX - box.left}px`,
-      top: `${event.clientY - box.top}px`,
-      width: `${pixels}px`,
-      height: `${pixels}px`,
-    });
-  }
-
-  /** Returns the radius of the brush in units of the shape. */
-  reach() {
-    return this.brush.size / Math.max(this.view.zoom, 0.5);
-  }
-
-  hover(event) {
-    const hint = $("hint");
-    const shown = this.scenes?.[0]?.mesh;
-    const found = shown && shown.nFaces <= 30_000 && this.pick(event);
-    hint.hidden = !found;
-    if (!found) return;
-    const { mesh, values } = found.scene;
-    const box = this.canvas.getBoundingClientRect();
-    hint.style.left = `${Math.min(event.clientX - box.left + 14, box.width - 150)}px`;
-    hint.style.top = `${event.clientY - box.top + 14}px`;
-    if (values) {
-      const value = values[mesh.faces[3 * found.face]];
-      hint.replaceChildren(value.toFixed(2));
-    } else {
-      const label = this.paintedLabels(mesh)[found.face];
-      hint.replaceChildren(swatch(this.app.colour(label)), this.app.labelName(label));
-    }
-  }
-
-  /**
-   * Paints at the pointer. Returns false if the pointer is not on the shape, or no label is
-   * selected.
-   */
-  paint(event) {
-    const { brush } = this;
-    const found = brush.label !== null && this.pick(event);
-    if (!found) return false;
-    const { mesh } = found.scene;
-    let faces;
-    if (brush.tool === "part") {
-      const labels = this.paintedLabels(mesh);
-      const label = labels[found.face];
-      faces = mesh.flood(found.face, (f) => labels[f] === label);
-    } else {
-      const reach = this.reach();
-      const near = (f) => Math.hypot(...mesh.centre(f).map((x, i) => x - found.point[i])) < reach;
-      faces = mesh.flood(found.face, near);
-    }
-    for (const f of faces)
-      this.painted.paint(mesh.polygons[f], brush.tool === "eraser" ? null : brush.label);
-    this.colour();
-    this.draw();
-    this.app.panel.paintedChanged();
-    return true;
-  }
-
-  /** Paints a part of the list: does without a mouse what the brush does. */
-  paintPart(highlight) {
-    const mesh = this.scenes?.[0]?.mesh;
-    if (!mesh?.polygons || this.brush.label === null) return;
-    const covers = this.highlighted(mesh, highlight);
-    this.painted.begin();
-    for (let f = 0; f < mesh.nFaces; f++)
-      if (covers(f)) this.painted.paint(mesh.polygons[f], this.brush.label);
-    this.painted.end();
-    this.colour();
-    this.draw();
-    this.app.panel.paintedChanged();
-  }
-
-  discard() {
-    this.painted.clear();
-    this.repaint();
-  }
-
-  /** Undoes or repeats a stroke. Returns false if there is none. */
-  stroke(redo) {
-    const moved = redo ? this.painted.redo() : this.painted.undo();
-    if (moved) this.repaint();
-    return moved;
-  }
-
-  repaint() {
-    this.colour();
-    this.draw();
-    this.app.panel.paintedChanged();
-  }
-
-  /** Returns runs of polygons with the same painted label: first, count, label. */
-  runs() {
-    const runs = [];
-    const { labels } = this.painted;
-    for (const polygon of [...labels.keys()].sort((a, b) => a - b)) {
-      const label = labels.get(polygon);
-      const last = runs.at(-1);
-      if (last && last[0] + last[1] === polygon && last[2] === label) last[1]++;
-      else runs.push([polygon, 1, label]);
-    }
-    return runs;
-  }
-}
-
-/** Returns connected pieces of equal label, with their shares of the area. */
-function piecesOf(mesh) {
-  const { nFaces, labels } = mesh;
-  const normals = mesh.faceNormals;
-  const area = (f) => Math.hypot(normals[3 * f], normals[3 * f + 1], normals[3 * f + 2]);
-  const seen = new Uint8Array(nFaces);
-  const pieces = [];
-  let all = 0;
-  for (let f = 0; f < nFaces; f++) {
-    all += area(f);
-    if (seen[f]) continue;
-    const faces = new Set(mesh.flood(f, (g) => labels[g] === labels[f]));
-    let sum = 0;
-    for (const g of faces) {
-      seen[g] = 1;
-      sum += area(g);
-    }
-    pieces.push({ label: labels[f], share: sum, faces });
-  }
-  for (const piece of pieces) piece.share /= all || 1;
-  return pieces;
-}
-
-/** Returns the colour of each vertex: that of the labels around it. */
-function labelColours(mesh, app) {
-  const of = new Int32Array(mesh.positions.length / 3).fill(-1);
-  for (let c = 0; c < mesh.faces.length; c++) of[mesh.faces[c]] = mesh.labels[(c / 3) | 0];
-  return (v) => app.colour(of[v]);
-}
-
-/** Returns the colour of each vertex by its position, so that the map's targets can be seen. */
-function placeColours(mesh) {
-  const p = mesh.positions;
-  const low = [1, 1, 1];
-  const high = [-1, -1, -1];
-  for (let i = 0; i < p.length; i++) {
-    low[i % 3] = Math.min(low[i % 3], p[i]);
-    high[i % 3] = Math.max(high[i % 3], p[i]);
-  }
-  return (v) =>
-    [0, 1, 2].map((i) => 40 + (205 * (p[3 * v + i] - low[i])) / (high[i] - low[i] || 1));
 }

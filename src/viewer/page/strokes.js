@@ -25,11 +25,14 @@ class Strokes {
   /** Paints a polygon within the stroke; null removes the painted label. */
   paint(polygon, label) {
     const { open, labels } = this;
-    if (!open.before.has(polygon)) open.before.set(polygon, labels.get(polygon));
+    const was = labels.get(polygon);
+    if (was === (label ?? undefined)) return;
+    if (!open.before.has(polygon)) open.before.set(polygon, was);
     if (label === null) labels.delete(polygon);
     else labels.set(polygon, label);
   }
 
+  /** Ends a stroke. One that changed nothing is no step. */
   end() {
     const { open } = this;
     this.open = null;
