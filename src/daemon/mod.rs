@@ -31,6 +31,7 @@ mod metrics;
 mod operation;
 mod outbox;
 mod placing;
+mod proposing;
 mod progress;
 mod publish;
 mod queues;

@@ -10,6 +10,7 @@ mod isolation;
 mod life;
 mod overload;
 mod paths;
+mod proposing;
 mod refusing;
 mod repeats;
 mod resident;
