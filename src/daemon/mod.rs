@@ -30,6 +30,7 @@ mod memory;
 mod metrics;
 mod operation;
 mod outbox;
+mod outcome;
 mod placing;
 mod proposing;
 mod progress;

@@ -7,6 +7,7 @@
 
 use crate::daemon::describing::{MAX_ATTEMPTS, note_death, prepare};
 use crate::daemon::failures::{cancelled, died_each_time, failed, panicked, too_long};
+use crate::daemon::outcome::outcome;
 use crate::daemon::proposing::{Next, Proposing};
 use crate::daemon::shared::{Daemon, Notice, blocking};
 use crate::daemon::work::{Outcome, Prepared, Step};
@@ -265,26 +266,6 @@ fn try_to_place(
             n if n >= MAX_ATTEMPTS => return Ok(Err(died_each_time(&text, out_of_memory, n))),
             _ => {}
         }
-    }
-}
-
-/// The outcome that a worker reports. The failure of its disk is the failure of this process's
-/// disk.
-pub(super) fn outcome(
-    daemon: &Daemon,
-    report: &serde_json::Value,
-) -> Result<worker::Outcome, LibraryError> {
-    match worker::read_report(report) {
-        Ok(worker::Report::Outcome(outcome)) => Ok(outcome),
-        Ok(worker::Report::NoSpace(path)) => Err(StoreError::NoSpace { path }.into()),
-        Ok(worker::Report::ReadOnly(cause)) => {
-            Err(daemon.library.store().health().stop(cause).into())
-        }
-        Err(text) => Ok(worker::Outcome::Failed(failed(
-            Code::Internal,
-            Reason::WorkerDied,
-            text,
-        ))),
     }
 }
 

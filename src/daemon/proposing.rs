@@ -4,7 +4,7 @@
 //! again later. It changes nothing but the proposals, so it does not hold the collection.
 
 use crate::daemon::describing::MAX_ATTEMPTS;
-use crate::daemon::placing::outcome;
+use crate::daemon::outcome::outcome;
 use crate::daemon::shared::{Daemon, blocking};
 use crate::daemon::work::Step;
 use crate::daemon::worker::{self, Ended, Placing};
@@ -22,6 +22,8 @@ const QUIET: Duration = Duration::from_secs(1);
 #[derive(Default)]
 pub(super) struct Proposing {
     is_done: bool,
+    /// Whether the last step was made and nothing has happened since.
+    is_quiet: bool,
     /// Steps that ended their worker, in a row.
     n_deaths: u32,
 }
@@ -67,12 +69,19 @@ impl Proposing {
         collection: &str,
         steps: &mut mpsc::UnboundedReceiver<Step>,
     ) -> Next {
-        if !daemon.library.lacks_proposals(collection).unwrap_or(false) {
+        let name = collection.to_owned();
+        let lacks = blocking(daemon, move |d| d.library.lacks_proposals(&name)).await;
+        // A collection that cannot be read is reported to those who ask for it.
+        if !matches!(lacks, Ok(Ok(true))) {
             self.is_done = true;
             return Next::Again;
         }
+        let quiet = match std::mem::take(&mut self.is_quiet) {
+            true => Duration::ZERO,
+            false => QUIET,
+        };
         let ready = async {
-            tokio::time::sleep(QUIET).await;
+            tokio::time::sleep(quiet).await;
             let permit = daemon.capacity.proposing.acquire().await;
             let mut changes = daemon.work.changes();
             while !is_idle(daemon) && changes.changed().await.is_ok() {}
@@ -104,7 +113,7 @@ impl Proposing {
             tracing::error!(collection, error, "proposals cannot be made");
         };
         match made {
-            Ok(Made::One) => self.n_deaths = 0,
+            Ok(Made::One) => (self.n_deaths, self.is_quiet) = (0, true),
             Ok(Made::None) => self.is_done = true,
             Ok(Made::Interrupted) => {}
             Ok(Made::Failed(error)) | Err(error) => {

@@ -77,13 +77,13 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
 }
 
 /// A picture of a shape, and its name.
-pub(crate) struct Cell {
-    pub(crate) name: String,
-    pub(crate) picture: Canvas,
+pub(in crate::commands) struct Cell {
+    pub(in crate::commands) name: String,
+    pub(in crate::commands) picture: Canvas,
 }
 
 /// Draws shapes side by side, below a legend: text and colour of each entry.
-pub(crate) fn contact_sheet(legend: &[(String, [u8; 3])], cells: &[Cell]) -> Canvas {
+pub(in crate::commands) fn contact_sheet(legend: &[(String, [u8; 3])], cells: &[Cell]) -> Canvas {
     let n_columns = columns(cells.len());
     let n_rows = cells.len().div_ceil(n_columns);
     let width = n_columns * (CELL + MARGIN) + MARGIN;
@@ -100,7 +100,11 @@ pub(crate) fn contact_sheet(legend: &[(String, [u8; 3])], cells: &[Cell]) -> Can
 }
 
 /// One shape in the colours of its polygons.
-pub(crate) fn picture(mesh: &ParsedMesh, colours: &[[u8; 3]], up: Option<[f64; 3]>) -> Canvas {
+pub(in crate::commands) fn picture(
+    mesh: &ParsedMesh,
+    colours: &[[u8; 3]],
+    up: Option<[f64; 3]>,
+) -> Canvas {
     let view = View::new(&mesh.vertices, up);
     let corners = mesh
         .triangles
@@ -189,7 +193,7 @@ fn fitting(name: &str, width: usize) -> String {
     format!("{kept}..")
 }
 
-pub(crate) fn axis(up: wire::Up) -> Option<[f64; 3]> {
+pub(super) fn axis(up: wire::Up) -> Option<[f64; 3]> {
     Some(match up {
         wire::Up::PlusX => [1.0, 0.0, 0.0],
         wire::Up::MinusX => [-1.0, 0.0, 0.0],

@@ -700,7 +700,7 @@ class AsyncCollection:
         reply, raw = await self._call("get_proposal", n=n)
         return {found.shape: raw.array(found.labels) for found in reply.shapes}
 
-    async def choose(self, n: int, *, set: str = "") -> t.Chosen:  # noqa: A002
+    async def choose(self, n: int, *, set: str = "") -> t.Chosen:
         """Makes proposal ``n`` the labels; all shapes follow, and :meth:`undo` restores the labels
         before. ``set``, if given, must be that of the present proposals."""
         reply, _ = await self._call("choose_proposal", n=n, set=set)
