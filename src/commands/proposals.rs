@@ -58,12 +58,14 @@ pub(crate) fn run(args: &Proposals, mut session: Session) -> Outcome {
             "{n}  {labels:<9}  value {value:5.2}  differs {differs:.2}{in_force}"
         ))?;
     }
-    let shapes = counted(found.n_shapes, "shape");
     if found.n_steps > 0 {
         let (n_done, n_steps) = (found.n_done, found.n_steps);
         eprintln!("{n_done} of {n_steps} steps of making new proposals are done");
     }
-    eprintln!("found on {shapes}; `coseg choose {collection} N` makes one of them the labels");
+    if !found.proposals.is_empty() {
+        let shapes = counted(found.n_shapes, "shape");
+        eprintln!("found on {shapes}; `coseg choose {collection} N` makes one of them the labels");
+    }
     Ok(true)
 }
 

@@ -26,7 +26,7 @@ fn chairs(n: u32) -> Vec<(String, String)> {
 
 fn add_chairs(client: &mut Client, chairs: &[(String, String)]) {
     for (name, text) in chairs {
-        add(client, "c", &[(name, text)]);
+        add(client, "c", &[(name.as_str(), text.as_str())]);
     }
     wait_idle(client, "c");
 }
