@@ -160,8 +160,8 @@ pub(crate) enum Command {
     Proposals(Proposals),
     /// Make one of the proposals the labels
     Choose(Choose),
-    /// Undo the newest correction, answer, verdict, name, merge, split, change of the up axis or choice;
-    /// repeat to go further back
+    /// Undo the newest correction, answer, verdict, name, merge, split, change of the up axis or
+    /// choice; repeat to go further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]

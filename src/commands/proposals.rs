@@ -9,8 +9,8 @@ use crate::cli::{Choose, Proposals};
 use coseg::call;
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire;
+use coseg::library::label_colour;
 use coseg::mesh::ParsedMesh;
-use coseg::mesh::write::LabelStyle;
 use coseg::text::counted;
 use serde_json::{Value, json};
 use std::collections::HashMap;
@@ -166,19 +166,15 @@ fn draw(
                 let mesh = original.mesh(&shape.shape, labels.len())?;
                 meshes.insert(shape.shape.clone(), mesh);
             }
-            let colours: Vec<[u8; 3]> = labels
-                .iter()
-                .map(|l| LabelStyle::unnamed(*l).colour)
-                .collect();
+            let colours: Vec<[u8; 3]> = labels.iter().map(|l| label_colour(*l as u32)).collect();
             cells.push(Cell {
                 name: shape.shape.clone(),
                 picture: picture(&meshes[&shape.shape], &colours, up),
             });
         }
-        let classes = 0..p.n_labels as i32;
-        let legend: Vec<(String, [u8; 3])> = classes
-            .map(|c| (c.to_string(), LabelStyle::unnamed(c).colour))
-            .collect();
+        let classes = 0..p.n_labels;
+        let legend: Vec<(String, [u8; 3])> =
+            classes.map(|c| (c.to_string(), label_colour(c))).collect();
         let path = folder.join(format!("{}.png", p.n));
         let png = contact_sheet(&legend, &cells).png();
         let written = png.and_then(|png| std::fs::write(&path, png));

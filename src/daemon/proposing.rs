@@ -1,4 +1,4 @@
-//! Makes the proposals of a collection, one step at a time, while the daemon has nothing else to do.
+//! Makes the proposals of a collection, step by step, while the daemon has nothing else to do.
 //!
 //! A step is ended as soon as a shape of any collection is to be placed or relabelled, and made
 //! again later. It changes nothing but the proposals, so it does not hold the collection.

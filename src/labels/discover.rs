@@ -262,8 +262,8 @@ pub(super) struct Candidates<'a> {
 }
 
 impl<'a> Candidates<'a> {
-    /// Refines the labellings of [`pool`] with `k` labels. A metric is learned from the best of them,
-    /// and parts are grouped once more in that metric.
+    /// Refines the labellings of [`pool`] with `k` labels. A metric is learned from the best of
+    /// them, and parts are grouped once more in that metric.
     pub(super) fn new(
         shapes: &'a Prepared<'_>,
         criterion: &'a Criterion,

@@ -91,7 +91,7 @@ pub use reason::{Code, Reason};
 pub use remote::{PlacementTicket, state_from_json, state_to_json};
 pub use repair::Repaired;
 pub use resolution::{InputPair, InputShape, Resolution};
-pub use rows::report_to_json;
+pub use rows::{label_colour, report_to_json};
 pub use submit::{Described, Describer, StoredOriginals, Submission};
 pub use suggest::Suggestion;
 pub use types::{

@@ -392,8 +392,8 @@ pub(super) fn nothing_proposed(row: &CollectionRow) -> LibraryError {
     let message = match is_discovering {
         true => format!(
             "nothing is proposed for collection {name:?} yet: proposals are made from \
-             {MIN_PROPOSED_SHAPES} shapes on, and some seconds after shapes were added; add shapes, \
-             or wait"
+             {MIN_PROPOSED_SHAPES} shapes on, and some seconds after shapes were added; add \
+             shapes, or wait"
         ),
         false => format!(
             "nothing is proposed for collection {name:?}: a person labelled it before proposals \

@@ -326,7 +326,15 @@ fn the_command_line_lists_draws_and_chooses() {
     assert!(proposals.len() >= 4, "{found}");
     for p in proposals {
         let png = std::fs::read(p["png"].as_str().unwrap()).unwrap();
-        assert!(png.starts_with(b"\x89PNG\r\n\x1a\n"), "{p}");
+        let mut reader = png::Decoder::new(std::io::Cursor::new(png))
+            .read_info()
+            .unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut pixels).unwrap();
+        // The legend begins with the colour of the first class, which shapes have as well.
+        let is_orange = |c: &&[u8]| c[0] > c[1] && c[1] > c[2] && c[0] - c[2] > 60;
+        let n_orange = pixels.chunks(3).filter(is_orange).count();
+        assert!(n_orange > 500, "{n_orange} of {} pixels", pixels.len() / 3);
         assert!(p["value"].is_f64() && p["in_force"].is_boolean() && p["differs"].is_f64());
     }
     let (first, last) = (&proposals[0], proposals.len());
