@@ -4,12 +4,14 @@ mod care;
 mod maps;
 mod corrections;
 mod looking;
+mod proposals;
 mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use looking::{Top, Usd, View};
 pub(crate) use maps::{Map, Resolution, Transfer};
+pub(crate) use proposals::{Choose, Proposals};
 pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
 
 use crate::commands::demo::DemoArgs;
@@ -154,8 +156,12 @@ pub(crate) enum Command {
     Merge(Merge),
     /// Split one label into two
     Split(Split),
-    /// Undo the newest correction, answer, verdict, name, merge, split or change of the up axis;
-    /// repeat to go further back
+    /// List proposals: other divisions of the shapes into labels, from coarse to fine
+    Proposals(Proposals),
+    /// Make one of the proposals the labels
+    Choose(Choose),
+    /// Undo the newest correction, answer, verdict, name, merge, split, change of the up axis or
+    /// choice; repeat to go further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]

@@ -213,7 +213,7 @@ fn at(path: &Path, source: std::io::Error) -> CommandError {
     }
 }
 
-fn bad_reply(message: String) -> CommandError {
+pub(super) fn bad_reply(message: String) -> CommandError {
     CommandError::Client(ClientError::BadReply(message))
 }
 

@@ -30,6 +30,7 @@ mod mesh_files;
 mod name;
 mod nearest;
 mod npy;
+mod proposals;
 mod render;
 mod rm;
 mod serve;
@@ -145,6 +146,7 @@ impl CommandError {
             ErrorReason::NoLabel | ErrorReason::LabelMerged => {
                 "`coseg show --collection NAME` lists the labels"
             }
+            ErrorReason::ProposalsChanged => "`coseg proposals NAME` lists the present ones",
             ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
             ErrorReason::Draining => "start the daemon again; it resumes the accepted work",
             ErrorReason::ReadOnly | ErrorReason::Damaged => {
@@ -201,6 +203,8 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Correct(args) => correct::run(args, session()?),
         Command::Merge(args) => merge::merge(args, session()?),
         Command::Split(args) => merge::split(args, session()?),
+        Command::Proposals(args) => proposals::run(args, session()?),
+        Command::Choose(args) => proposals::choose(args, session()?),
         Command::Undo(args) => undo::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
         Command::Synth(args) => synth::run(args, cli.global.json)

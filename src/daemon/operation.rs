@@ -191,6 +191,8 @@ operations! {
             GetPortraits(GetPortraitsRequest) checked by check_portraits,
             SuggestNext(SuggestNextRequest),
             NextQuestion(NextQuestionRequest),
+            ListProposals(ListProposalsRequest),
+            GetProposal(GetProposalRequest),
         }
         /// Changes that take no work on shapes.
         Change {
@@ -205,6 +207,7 @@ operations! {
             ReviewShape(ReviewShapeRequest) checked by check_review,
             MergeLabels(MergeLabelsRequest),
             SplitLabel(SplitLabelRequest),
+            ChooseProposal(ChooseProposalRequest),
             Undo(UndoRequest),
             RemoveShape(RemoveShapeRequest),
         }
@@ -233,7 +236,10 @@ impl Operation {
         match self {
             Self::Fetch(_)
             | Self::Compute(
-                Compute::GetPortraits(_) | Compute::GetSpectrum(_) | Compute::GetHks(_),
+                Compute::GetPortraits(_)
+                | Compute::GetSpectrum(_)
+                | Compute::GetHks(_)
+                | Compute::GetProposal(_),
             ) => Cost::Bulk,
             _ => Cost::Short,
         }

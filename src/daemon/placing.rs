@@ -1,5 +1,5 @@
 //! Places the described shapes of one collection, strictly in order of acceptance. When there is
-//! nothing to place, stale shapes are relabelled.
+//! nothing to place, stale shapes are relabelled; when there are none, proposals are made.
 //!
 //! Workers do the work, as they do for describing, and attempts that end a worker are counted
 //! together with those of describing. A worker commits by itself, so the catalog decides what
@@ -7,6 +7,8 @@
 
 use crate::daemon::describing::{MAX_ATTEMPTS, note_death, prepare};
 use crate::daemon::failures::{cancelled, died_each_time, failed, panicked, too_long};
+use crate::daemon::outcome::outcome;
+use crate::daemon::proposing::{Next, Proposing};
 use crate::daemon::shared::{Daemon, Notice, blocking};
 use crate::daemon::work::{Outcome, Prepared, Step};
 use crate::daemon::worker::{self, Ended, Placing};
@@ -60,12 +62,20 @@ pub(crate) async fn place_in_order(
 ) {
     let mut relabel = true;
     let mut deaths = Deaths::default();
+    let mut proposing = Proposing::default();
     loop {
         let step = match steps.try_recv() {
             Ok(step) => step,
             Err(mpsc::error::TryRecvError::Empty) if relabel => {
                 relabel = relabel_next(&daemon, &collection, &mut deaths).await;
                 continue;
+            }
+            Err(mpsc::error::TryRecvError::Empty) if proposing.is_wanted() => {
+                match proposing.next(&daemon, &collection, &mut steps).await {
+                    Next::Again => continue,
+                    Next::Step(step) => step,
+                    Next::Ended => return,
+                }
             }
             Err(_) => match steps.recv().await {
                 Some(step) => step,
@@ -76,6 +86,7 @@ pub(crate) async fn place_in_order(
             Step::Place(ready) => ready,
             Step::Relabel => {
                 (relabel, deaths) = (true, Deaths::default());
+                proposing = Proposing::default();
                 continue;
             }
         };
@@ -99,6 +110,7 @@ pub(crate) async fn place_in_order(
             return;
         }
         relabel = true;
+        proposing = Proposing::default();
     }
 }
 
@@ -228,7 +240,9 @@ fn try_to_place(
                     return Ok(Ok(()));
                 }
                 worker::Outcome::Failed(why) => return Ok(Err(why)),
-                worker::Outcome::State(_) | worker::Outcome::Relabelled(_) => return Ok(Ok(())),
+                worker::Outcome::State(_)
+                | worker::Outcome::Relabelled(_)
+                | worker::Outcome::Proposed(_) => return Ok(Ok(())),
             },
             Err(Ended::Stopped) => {
                 // It may have been done in that moment.
@@ -252,23 +266,6 @@ fn try_to_place(
             n if n >= MAX_ATTEMPTS => return Ok(Err(died_each_time(&text, out_of_memory, n))),
             _ => {}
         }
-    }
-}
-
-/// The outcome that a worker reports. The failure of its disk is the failure of this process's
-/// disk.
-fn outcome(daemon: &Daemon, report: &serde_json::Value) -> Result<worker::Outcome, LibraryError> {
-    match worker::read_report(report) {
-        Ok(worker::Report::Outcome(outcome)) => Ok(outcome),
-        Ok(worker::Report::NoSpace(path)) => Err(StoreError::NoSpace { path }.into()),
-        Ok(worker::Report::ReadOnly(cause)) => {
-            Err(daemon.library.store().health().stop(cause).into())
-        }
-        Err(text) => Ok(worker::Outcome::Failed(failed(
-            Code::Internal,
-            Reason::WorkerDied,
-            text,
-        ))),
     }
 }
 
@@ -381,6 +378,7 @@ fn relabel_remotely(
             worker::Outcome::Relabelled(n_shapes) => Ok(Ok(n_shapes)),
             worker::Outcome::Failed(why) => Ok(Err(why.message)),
             worker::Outcome::State(state) => Ok(Err(format!("a worker reported {state:?}"))),
+            worker::Outcome::Proposed(_) => Ok(Err("a worker made proposals instead".to_owned())),
         },
         Err(Ended::Stopped) => Ok(Err(format!("it took more than {} s", limit.as_secs()))),
         Err(Ended::Died { text, .. }) => Ok(Err(text)),

@@ -92,6 +92,8 @@ pub(crate) struct Capacity {
     pub(crate) describing: Arc<Semaphore>,
     /// A permit for each shape that may be placed at a time.
     pub(crate) placing: Arc<Semaphore>,
+    /// A permit for the collection whose proposals are made.
+    pub(crate) proposing: Semaphore,
     /// A permit for each edit that may be carried out at a time.
     pub(crate) editing: Semaphore,
     /// A permit for each thread that reads a file which a request names by path.
@@ -232,6 +234,7 @@ impl Capacity {
             describe_memory: Budget::new(limits.describe_bytes() - limits.prepared_bytes()),
             describing: Arc::new(Semaphore::new(n_workers)),
             placing: Arc::new(Semaphore::new(n_workers)),
+            proposing: Semaphore::new(1),
             editing: Semaphore::new(n_workers),
             reading: Arc::new(Semaphore::new(MAX_READING_THREADS)),
         }

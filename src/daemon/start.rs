@@ -144,10 +144,14 @@ fn share(library: &Library, endpoint: &Endpoint) -> Result<(), LibraryError> {
     Ok(store.share_lock()?)
 }
 
-/// Resumes the shapes and the stale labels that the previous run left.
+/// Resumes the shapes, the stale labels and the proposals that the previous run left.
 fn resume(daemon: &Arc<Daemon>, found: Found) {
-    for collection in found.collections.iter().filter(|c| c.n_stale > 0) {
-        daemon.nudge(&collection.spec.name);
+    for collection in &found.collections {
+        let name = &collection.spec.name;
+        // A collection that cannot be read is reported to those who ask for it.
+        if collection.n_stale > 0 || daemon.library.lacks_proposals(name).unwrap_or(false) {
+            daemon.nudge(name);
+        }
     }
     let queued = found.queued;
     if !queued.is_empty() {

@@ -117,6 +117,17 @@ pub fn question(q: &wire::NextQuestionReply, faces: &[u32]) -> Value {
     })
 }
 
+/// A proposal.
+pub fn proposal(p: &wire::Proposal) -> Value {
+    json!({
+        "n": p.n,
+        "n_labels": p.n_labels,
+        "value": p.value,
+        "in_force": p.in_force,
+        "differs": p.differs,
+    })
+}
+
 /// The state of a verdict in lower case.
 pub fn review_state(state: wire::ReviewState) -> String {
     short(state.as_str_name(), "REVIEW_STATE_")
@@ -264,6 +275,14 @@ pub fn event(e: &wire::Event) -> Value {
         }
         Some(Kind::Undone(u)) => ("undone", json!({ "change": u.change })),
         Some(Kind::UpChanged(c)) => ("up_changed", json!({ "from": c.from, "to": c.to })),
+        Some(Kind::Chosen(c)) => {
+            let body = json!({
+                "proposal": c.proposal,
+                "n_labels": c.n_labels,
+                "value": c.value,
+            });
+            ("chosen", body)
+        }
         Some(Kind::Reclustered(r)) => {
             let body = json!({
                 "score_before": r.score_before,
@@ -333,6 +352,11 @@ pub fn event_line(e: &wire::Event) -> String {
         Some(Kind::UpChanged(c)) => {
             format!("up axis {} instead of {}", c.to, c.from)
         }
+        Some(Kind::Chosen(c)) => format!(
+            "proposal {} chosen, {}",
+            c.proposal,
+            counted(c.n_labels.into(), "label")
+        ),
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
             let before = r

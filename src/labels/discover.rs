@@ -208,10 +208,11 @@ pub fn discover(
     }
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();
-    let k = options
-        .n_labels
-        .unwrap_or_else(|| estimate(&shapes, &criterion, options));
-    let chosen = choose(&shapes, &criterion, k, options.seed, current);
+    let pool = match options.n_labels {
+        Some(k) => (k, pool(&shapes, &criterion, k, options.seed)),
+        None => estimate(&shapes, &criterion, options),
+    };
+    let chosen = choose(&shapes, &criterion, pool, options.seed, current);
     chosen.unwrap_or_else(|| {
         // With fewer patches than labels, each patch gets a label of its own.
         let labels = input
@@ -234,65 +235,90 @@ pub fn discover(
     })
 }
 
-/// Returns the number of labels whose best candidate has the highest value.
-fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOptions) -> usize {
-    let value = |k: usize| {
+/// Returns the number of labels whose best candidate has the highest value, and the candidates.
+fn estimate(
+    shapes: &Prepared<'_>,
+    criterion: &Criterion,
+    options: &DiscoveryOptions,
+) -> (usize, Vec<Vec<u32>>) {
+    let valued = |k: usize| {
         let candidates = pool(shapes, criterion, k, options.seed);
         let judge = Judge::new(criterion, candidates, &shapes.area, k);
-        judge.comparable_value()
+        (judge.comparable_value(), (k, judge.into_candidates()))
     };
     let counts = (2..=options.max_labels.max(2)).into_par_iter();
-    let values: Vec<(usize, f64)> = counts.map(|k| (k, value(k))).collect();
-    let best = values
+    let valued: Vec<(f64, (usize, Vec<Vec<u32>>))> = counts.map(valued).collect();
+    let best = valued
         .into_iter()
-        .reduce(|best, next| if next.1 > best.1 { next } else { best });
-    best.map_or(2, |(k, _)| k)
+        .reduce(|best, next| if next.0 > best.0 { next } else { best });
+    best.map_or((2, Vec::new()), |(_, pool)| pool)
 }
 
-/// Returns the best labelling with `k` labels. Candidates are refined patch by patch. A metric is
-/// learned from the best of them, and parts are grouped once more in that metric. The best of all
-/// are refined face by face and judged again. Returns `None` if there is no candidate.
+/// The candidate labellings with one number of labels, each refined patch by patch, and their
+/// judge.
+pub(super) struct Candidates<'a> {
+    pub(super) refined: Vec<Vec<u32>>,
+    pub(super) judge: Judge<'a>,
+}
+
+impl<'a> Candidates<'a> {
+    /// Refines the labellings of [`pool`] with `k` labels. A metric is learned from the best of
+    /// them, and parts are grouped once more in that metric.
+    pub(super) fn new(
+        shapes: &'a Prepared<'_>,
+        criterion: &'a Criterion,
+        patchwise: &Patchwise<'_>,
+        (k, candidates): (usize, Vec<Vec<u32>>),
+        seed: u64,
+    ) -> Self {
+        let refined_all = |labellings: &[Vec<u32>]| -> Vec<Vec<u32>> {
+            labellings
+                .par_iter()
+                .map(|l| patchwise.refine(l, k))
+                .collect()
+        };
+        let mut refined = refined_all(&candidates);
+        let mut judge = Judge::new(criterion, candidates, &shapes.area, k);
+        let sources = judge.best(&refined, N_METRIC_SOURCES);
+        let sources: Vec<&Vec<u32>> = sources.iter().map(|&c| &refined[c]).collect();
+        if let Some(metric) = patchwise.metric(&sources, k) {
+            let features: Vec<Features> = (shapes.input.shapes.par_iter())
+                .map(|s| in_metric(s.features, &metric))
+                .collect();
+            let input = DiscoveryInput {
+                shapes: shapes
+                    .input
+                    .shapes
+                    .iter()
+                    .zip(&features)
+                    .map(|(s, features)| ShapeInput { features, ..*s })
+                    .collect(),
+                up_known: shapes.up_known,
+            };
+            let in_metric = Prepared {
+                learned_metric: true,
+                ..Prepared::new(&input)
+            };
+            let more = pool(&in_metric, criterion, k, seed);
+            refined.extend(refined_all(&more));
+            judge = judge.with_more(more);
+        }
+        Self { refined, judge }
+    }
+}
+
+/// Returns the best labelling with as many labels as those of a pool: the best candidates are
+/// refined face by face and judged again. Returns `None` if there is no candidate.
 fn choose(
     shapes: &Prepared<'_>,
     criterion: &Criterion,
-    k: usize,
+    pool: (usize, Vec<Vec<u32>>),
     seed: u64,
     current: Option<(&[Vec<u32>], usize)>,
 ) -> Option<Discovery> {
+    let k = pool.0;
     let patchwise = Patchwise::new(shapes);
-    let candidates = pool(shapes, criterion, k, seed);
-    let refined_all = |labellings: &[Vec<u32>]| -> Vec<Vec<u32>> {
-        labellings
-            .par_iter()
-            .map(|l| patchwise.refine(l, k))
-            .collect()
-    };
-    let mut refined = refined_all(&candidates);
-    let mut judge = Judge::new(criterion, candidates, &shapes.area, k);
-    let sources = judge.best(&refined, N_METRIC_SOURCES);
-    let sources: Vec<&Vec<u32>> = sources.iter().map(|&c| &refined[c]).collect();
-    if let Some(metric) = patchwise.metric(&sources, k) {
-        let features: Vec<Features> = (shapes.input.shapes.par_iter())
-            .map(|s| in_metric(s.features, &metric))
-            .collect();
-        let input = DiscoveryInput {
-            shapes: shapes
-                .input
-                .shapes
-                .iter()
-                .zip(&features)
-                .map(|(s, features)| ShapeInput { features, ..*s })
-                .collect(),
-            up_known: shapes.up_known,
-        };
-        let in_metric = Prepared {
-            learned_metric: true,
-            ..Prepared::new(&input)
-        };
-        let more = pool(&in_metric, criterion, k, seed);
-        refined.extend(refined_all(&more));
-        judge = judge.with_more(more);
-    }
+    let Candidates { refined, judge } = Candidates::new(shapes, criterion, &patchwise, pool, seed);
     let on_faces: Vec<Vec<Vec<u32>>> = judge
         .best(&refined, SHORTLIST)
         .into_par_iter()
@@ -315,7 +341,11 @@ fn choose(
 }
 
 /// Alternates between fitting a linear classifier of all faces and a cut of each shape.
-fn refine(input: &DiscoveryInput<'_>, mut labels: Vec<Vec<u32>>, k: usize) -> Vec<Vec<u32>> {
+pub(super) fn refine(
+    input: &DiscoveryInput<'_>,
+    mut labels: Vec<Vec<u32>>,
+    k: usize,
+) -> Vec<Vec<u32>> {
     for _ in 0..REFINEMENTS {
         let dim = input.shapes[0].features.dim;
         let mut statistics = Statistics::empty(k, dim);

@@ -69,6 +69,11 @@ impl<'a> Judge<'a> {
         Self::new(self.criterion, self.candidates, self.area, self.k)
     }
 
+    /// Returns the candidates.
+    pub(super) fn into_candidates(self) -> Vec<Vec<u32>> {
+        self.candidates
+    }
+
     /// Returns the value of each labelling of all patches with labels below `k`.
     pub(super) fn values(&self, labellings: &[Vec<u32>], k: usize) -> Vec<f64> {
         labellings

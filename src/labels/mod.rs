@@ -17,6 +17,7 @@ mod judge;
 mod model;
 mod patchwise;
 mod prior;
+mod propose;
 pub mod score;
 #[cfg(test)]
 mod test_shapes;
@@ -28,4 +29,7 @@ pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, disc
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
 pub use prior::{Pinned, PriorLabels};
+pub use propose::{
+    Candidate, N_PROPOSALS, PROPOSED_LABELS, Proposal, agreement, candidates, propose,
+};
 pub use up::{UpVote, contradicting_up, estimate_up};

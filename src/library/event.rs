@@ -40,7 +40,7 @@ pub enum EventKind {
         /// The new version.
         version: u64,
         /// The rule that allowed it: `reclustering`, `correction`, `carrying`, `merge`, `split`,
-        /// `undo`.
+        /// `undo`, `choice`.
         cause: String,
         /// Share of the shape's area that moved, from label to label (-1: unlabelled).
         moves: Vec<LabelMove>,
@@ -99,6 +99,15 @@ pub enum EventKind {
         /// The new axis.
         to: String,
     },
+    /// A person chose a proposal, which became the labels.
+    Chosen {
+        /// Its number.
+        proposal: u32,
+        /// Number of its labels.
+        n_labels: u32,
+        /// Its value; see docs/methods.md.
+        value: f64,
+    },
     /// The parts of the collection were clustered again.
     Reclustered {
         /// Score of the old labelling; see docs/methods.md.
@@ -127,6 +136,7 @@ impl EventKind {
             Self::Corrected { .. } => "corrected",
             Self::Undone { .. } => "undone",
             Self::UpChanged { .. } => "up_changed",
+            Self::Chosen { .. } => "chosen",
             Self::Reclustered { .. } => "reclustered",
         }
     }

@@ -18,11 +18,11 @@ use serde::{Deserialize, Serialize};
 /// The result of undoing a change.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
-    /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split` or
-    /// `up`.
+    /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split`,
+    /// `up` or `choose`.
     pub change: String,
-    /// What the change concerned: a shape, a label or an axis; empty in a reply that an earlier
-    /// version stored.
+    /// What the change concerned: a shape, a label, an axis or a proposal; empty in a reply that
+    /// an earlier version stored.
     #[serde(default)]
     pub subject: String,
     /// Number of changes by persons that can still be undone.
@@ -33,9 +33,9 @@ pub struct Undone {
 
 impl Library {
     /// Undoes the newest change that a person made to a collection: a correction, a name, a merge,
-    /// a split or another up axis. Shapes get the labels back that they had before it; shapes that
-    /// were added since are relabelled. Can be repeated, back to the first change. Cannot itself be
-    /// undone.
+    /// a split, another up axis or the choice of a proposal. Shapes get the labels back that they
+    /// had before it; shapes that were added since are relabelled. Can be repeated, back to the
+    /// first change. Cannot itself be undone.
     ///
     /// # Errors
     /// There is no such collection, or nothing to undo.
@@ -76,7 +76,7 @@ impl Library {
 /// Returns the subject of a change from its stored details.
 fn subject(detail: &str) -> String {
     let detail: serde_json::Value = serde_json::from_str(detail).unwrap_or_default();
-    let found = ["shape", "label", "from"]
+    let found = ["shape", "label", "from", "proposal"]
         .iter()
         .find_map(|key| detail.get(key));
     match found {

@@ -24,6 +24,7 @@ pub(super) mod cause {
     pub(crate) const MERGE: &str = "merge";
     pub(crate) const SPLIT: &str = "split";
     pub(crate) const UNDO: &str = "undo";
+    pub(crate) const CHOICE: &str = "choice";
 }
 
 /// Labels of one shape, ready to be committed; the commit sets their sequence number.

@@ -129,7 +129,7 @@ pub(super) fn format_from_name(name: &str, location: &str) -> Result<Format> {
 
 /// Returns the colour of a label by its id: the eight colours of Okabe and Ito, which colour-blind
 /// people can distinguish, then golden-angle hues.
-pub(super) fn label_colour(id: u32) -> [u8; 3] {
+pub fn label_colour(id: u32) -> [u8; 3] {
     const OKABE_ITO: [[u8; 3]; 8] = [
         [230, 159, 0],
         [86, 180, 233],

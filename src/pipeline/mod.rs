@@ -56,7 +56,8 @@ pub use questions::{
     Background, CandidateShape, N_OFFERED, N_PARTS, Question, ShapeParts, next_question,
 };
 pub use recluster::{
-    LabelChange, ReclusterOptions, Reclustering, Representative, batch, recluster,
+    LabelChange, ReclusterOptions, Reclustering, Representative, adopt, batch, proposal_candidates,
+    proposals, recluster,
 };
 pub use split::{split_faces, split_model};
 pub use supervised::{

@@ -3,8 +3,8 @@
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
-    Baseline, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation,
-    ShapeInput, Statistics, baseline, discover,
+    Baseline, Candidate, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel,
+    Normalisation, Proposal, ShapeInput, Statistics, baseline, candidates, discover, propose,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -81,15 +81,51 @@ pub fn recluster(
 ) -> Reclustering {
     let views: Vec<DescriptionView<'_>> = shapes.iter().map(|s| s.shape).collect();
     let together = Together::new(&views, options.up);
-    let input = together.input();
+    let current = old.map(|model| current_classes(shapes, model));
+    let current_input = current.as_deref().zip(old.map(|m| m.labels.len()));
+    let found = discover(&together.input(), &options.discovery, current_input);
+    relabelled(&together, found, current, old, epoch, options)
+}
+
+/// Makes a division of representatives the labels, whatever its value: `found` has the label of
+/// each of their proxy faces. Label ids and model follow as in [`recluster`].
+pub fn adopt(
+    shapes: &[Representative<'_>],
+    old: Option<&LabelModel>,
+    epoch: u64,
+    options: &ReclusterOptions,
+    found: Proposal,
+) -> Reclustering {
+    let views: Vec<DescriptionView<'_>> = shapes.iter().map(|s| s.shape).collect();
+    let together = Together::new(&views, options.up);
+    let current = old.map(|model| current_classes(shapes, model));
+    let found = Discovery {
+        labels: found.labels,
+        n_labels: found.n_labels,
+        value: found.value,
+        current_value: f64::NEG_INFINITY,
+    };
+    let options = ReclusterOptions {
+        min_gain: f64::NEG_INFINITY,
+        ..options.clone()
+    };
+    relabelled(&together, found, current, old, epoch, &options)
+}
+
+/// Returns the outcome of a re-clustering that found a labelling.
+fn relabelled(
+    together: &Together,
+    found: Discovery,
+    current: Option<Vec<Vec<u32>>>,
+    old: Option<&LabelModel>,
+    epoch: u64,
+    options: &ReclusterOptions,
+) -> Reclustering {
     let Together {
         normalisation,
         prepared,
         ..
-    } = &together;
-    let current = old.map(|model| current_classes(shapes, model));
-    let current_input = current.as_deref().zip(old.map(|m| m.labels.len()));
-    let found = discover(&input, &options.discovery, current_input);
+    } = together;
     let (old_score, new_score) = (found.current_value, found.value);
     let accepted = new_score > old_score + options.min_gain;
     let (labels, classes, changes) = match (accepted, current, old) {
@@ -200,6 +236,26 @@ pub fn batch(
         Some(which) => baseline(which, &input, n_labels, options.seed),
         None => discover(&input, &options, None).labels,
     }
+}
+
+/// Returns candidates for proposals with `k` labels on shapes that are all known.
+pub fn proposal_candidates(
+    shapes: &[DescriptionView<'_>],
+    up: Option<[f64; 3]>,
+    k: usize,
+) -> Vec<Candidate> {
+    let seed = DiscoveryOptions::default().seed;
+    candidates(&Together::new(shapes, up).input(), k, seed)
+}
+
+/// Picks proposals among the candidates with all numbers of labels, which
+/// [`proposal_candidates`] returned for the same shapes.
+pub fn proposals(
+    shapes: &[DescriptionView<'_>],
+    up: Option<[f64; 3]>,
+    candidates: &[Candidate],
+) -> Vec<Proposal> {
+    propose(&Together::new(shapes, up).input(), candidates)
 }
 
 /// Returns the classes of the old model that correspond to the representatives' labels.

@@ -49,9 +49,10 @@ pub use mapped::MappedDescription;
 pub use objects::{Kept, Objects};
 pub use prepared::PreparedShapes;
 pub use rows::{
-    CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow, LabelSummary,
-    LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow, ObjectKind,
-    ObjectRow, PassedPart, PointMapRow, RequestRow, ReviewRow, ShapeId, ShapeRow,
+    CandidatesRow, CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow,
+    LabelSummary, LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow,
+    ObjectKind, ObjectRow, PassedPart, PointMapRow, ProposalRow, RequestRow, ReviewRow, ShapeId,
+    ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

@@ -56,6 +56,32 @@ pub struct CollectionRow {
     pub state: Vec<u8>,
 }
 
+/// Candidates for proposals with one number of labels.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CandidatesRow {
+    /// Number of labels.
+    pub n_labels: u32,
+    /// The shapes that are divided, in the library's format.
+    pub basis: String,
+    /// The candidates, in the library's format.
+    pub found: Vec<u8>,
+}
+
+/// A division of some shapes into labels, of which a person can choose one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProposalRow {
+    /// Its number, from 1.
+    pub n: u32,
+    /// The shapes that are divided, in the library's format.
+    pub basis: String,
+    /// Number of labels.
+    pub n_labels: u32,
+    /// Its value.
+    pub value: f64,
+    /// Label of each face of each shape, in the library's format.
+    pub labels: Vec<u8>,
+}
+
 /// The kinds of object files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum ObjectKind {

@@ -537,6 +537,7 @@ def asking(r: Recorder) -> None:
     r.say(
         "add_shapes_asked", "two files", [a, b], **add([encoded("a"), encoded("b", 1)], "asked", create=two)
     )
+    r.say("error_no_proposals", "two shapes are too few to propose anything", list_proposals=of)
     r.say("next_question", "the part whose label is worth most", next_question=of)
     part = {**of, "shape": "a", "part": 0, "by": "ada"}
     r.say("answer_question", "a name, which makes a label", answer_question={**part, "named": "head"})
@@ -554,6 +555,11 @@ def asking(r: Recorder) -> None:
             review_shape={**of_b, "shape": shape, "state": "REVIEW_STATE_APPROVED"},
         )
         r.settle("asked")
+    r.say(
+        "error_labelled_by_person",
+        "labels follow from what a person labelled",
+        choose_proposal={**of, "n": 1},
+    )
     r.say("error_nothing_to_ask", "a person labelled every part", next_question={**of, "passed": True})
 
 

@@ -10,6 +10,7 @@ mod isolation;
 mod life;
 mod overload;
 mod paths;
+mod proposing;
 mod refusing;
 mod repeats;
 mod resident;
@@ -33,6 +34,21 @@ fn raw(kind: zmq::SocketType, endpoint: &str) -> zmq::Socket {
     socket.set_rcvtimeo(DEADLINE.as_millis() as i32).unwrap();
     socket.connect(endpoint).unwrap();
     socket
+}
+
+/// The proposals of a collection, once they are those for its present labels.
+fn proposals(client: &mut Client, collection: &str) -> wire::ListProposalsReply {
+    let begin = std::time::Instant::now();
+    loop {
+        let collection = collection.to_owned();
+        let request = wire::ListProposalsRequest { collection };
+        let found = call!(client, ListProposals(request)).unwrap();
+        if found.n_steps == 0 {
+            return found;
+        }
+        assert!(begin.elapsed() < 4 * DEADLINE, "{found:?}");
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
 }
 
 fn raw_error(socket: &zmq::Socket, frames: &[&[u8]]) -> wire::Error {

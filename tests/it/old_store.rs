@@ -10,7 +10,7 @@ use coseg::store::catalog::CATALOG_FORMAT;
 use coseg::store::{Store, StoreError};
 use std::path::{Path, PathBuf};
 
-const FORMATS: [u32; 3] = [1, 2, 3];
+const FORMATS: [u32; 4] = [1, 2, 3, 4];
 
 fn fixture(format: u32) -> PathBuf {
     let folder = format!("tests/fixtures/library-format-{format}");

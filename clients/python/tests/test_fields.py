@@ -78,6 +78,9 @@ CALLS: dict[str, Call] = {
     "next_question": lambda _, c: c.ask(),
     "answer_question": lambda _, c: c.answer("a", 0, 1),
     "review_shape": lambda _, c: c.approve("a"),
+    "list_proposals": lambda _, c: c.proposals(),
+    "get_proposal": lambda _, c: c.proposed_labels(1),
+    "choose_proposal": lambda _, c: c.choose(1),
 }
 
 

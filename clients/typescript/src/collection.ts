@@ -28,6 +28,7 @@ import type {
   Answer,
   Answered,
   ChangedLabel,
+  Chosen,
   CollectionInfo,
   Corrected,
   Descriptors,
@@ -41,6 +42,7 @@ import type {
   Neighbor,
   PartMatches,
   Points,
+  Proposals,
   Rows,
   Question,
   Settings,
@@ -464,7 +466,7 @@ export class Collection {
     return found[0]!;
   }
 
-  /** Undoes the newest correction, name, merge, split or change of the up axis. */
+  /** Undoes the newest correction, name, merge, split, change of the up axis or choice. */
   async undo(): Promise<Undone> {
     return plain((await this.library.call("undo", { collection: this.name }))[0]);
   }
@@ -506,6 +508,29 @@ export class Collection {
     const request = { collection: this.name, shape: name, state, by: options.by ?? "" };
     const [{ corrected }] = await this.library.call("reviewShape", request);
     return corrected && { ...plain(corrected), jobId: corrected.jobId };
+  }
+
+  /**
+   * Divisions of the shapes into labels, from coarse to fine, of which `choose` makes one the labels. They are made in
+   * the background: `nSteps` is 0 once they are those for the present labels.
+   */
+  async proposals(): Promise<Proposals> {
+    return plain((await this.library.call("listProposals", { collection: this.name }))[0]);
+  }
+
+  /**
+   * The class of each face of each shape in proposal `n`, by the names of the shapes that it divides, at most 40. Classes
+   * become label ids when it is chosen.
+   */
+  async proposedLabels(n: number): Promise<Map<string, Int32Array>> {
+    const [reply, raw] = await this.library.call("getProposal", { collection: this.name, n });
+    return new Map(reply.shapes.map((s) => [s.shape, raw.array(Int32Array, s.labels).data]));
+  }
+
+  /** Makes proposal `n` the labels; `set`, if given, must be that of the present proposals. */
+  async choose(n: number, options: { set?: string } = {}): Promise<Chosen> {
+    const request = { collection: this.name, n, set: options.set ?? "" };
+    return plain((await this.library.call("chooseProposal", request))[0]);
   }
 
   /** The shape that is most worth labelling by hand, or undefined if there is none. */

@@ -8,6 +8,7 @@ import type {
 } from "./gen/coseg/v1/analysis_pb.js";
 import type { Collection as WireCollection, LabelInfo, UpdateCollectionReply } from "./gen/coseg/v1/collection_pb.js";
 import type { CorrectLabelsReply, SuggestNextReply, UndoReply } from "./gen/coseg/v1/correction_pb.js";
+import type { ChooseProposalReply, ListProposalsReply } from "./gen/coseg/v1/proposal_pb.js";
 import type { NextQuestionReply } from "./gen/coseg/v1/question_pb.js";
 import type { HelloReply, StatsReply } from "./gen/coseg/v1/daemon_pb.js";
 import type { Event as WireEvent } from "./gen/coseg/v1/event_pb.js";
@@ -51,6 +52,10 @@ export type Undone = Plain<UndoReply>;
  * relabelled.
  */
 export type Updated = Plain<UpdateCollectionReply>;
+/** The proposals of a collection: divisions of its shapes into labels, of which a person can choose one. */
+export type Proposals = Plain<ListProposalsReply>;
+/** The result of choosing a proposal. */
+export type Chosen = Plain<ChooseProposalReply>;
 /** The shape that is most worth labelling by hand. */
 export type Suggestion = Plain<SuggestNextReply>;
 /** A person's verdict on the labels of a shape. */

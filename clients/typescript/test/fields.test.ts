@@ -80,6 +80,9 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   nextQuestion: (_, c) => c.ask(),
   answerQuestion: (_, c) => c.answer("a", 0, { label: 1 }),
   reviewShape: (_, c) => c.approve("a"),
+  listProposals: (_, c) => c.proposals(),
+  getProposal: (_, c) => c.proposedLabels(1),
+  chooseProposal: (_, c) => c.choose(1),
 };
 
 /** The result, or what is wrong with a reply that has other rows than requested. */

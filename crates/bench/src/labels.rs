@@ -2,12 +2,14 @@
 
 use crate::error::{BenchError, Outcome};
 use crate::print::{print_line, table};
+use crate::proposals::ProposalScores;
 use crate::session::{Session, log_warnings};
 use crate::stream::{Category, Run};
-use crate::{Global, stream};
+use crate::{Global, proposals, stream};
 use clap::Args;
 use coseg::ipc::convert::parse_up;
 use coseg::ipc::wire;
+use coseg::labels::N_PROPOSALS;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -49,6 +51,14 @@ pub(crate) struct BenchLabels {
         value_parser = clap::value_parser!(u32).range(..=100)
     )]
     exemplars: Vec<u32>,
+    /// After the stream, choose each of so many proposals in turn, and score the labels that follow
+    /// from it; the best counts. Proposals do not depend on the number of part kinds
+    #[arg(
+        long,
+        value_name = "N",
+        value_parser = clap::value_parser!(u32).range(1..=N_PROPOSALS as i64)
+    )]
+    proposals: Option<u32>,
     /// Only stream: no batch run, no baselines (which use at most 60 evenly spread shapes)
     #[arg(long)]
     no_baselines: bool,
@@ -80,6 +90,16 @@ impl Row {
         (0..n)
             .map(|i| mean(self.runs.iter().map(|r| r.with_exemplars[i])))
             .collect()
+    }
+
+    /// Accuracy after the best of the proposals was chosen, over the orders.
+    fn best_of_proposals(&self) -> Option<f64> {
+        let best = self
+            .runs
+            .iter()
+            .map(|r| r.proposals.as_ref().map(ProposalScores::best));
+        let best: Option<Vec<f64>> = best.collect();
+        best.map(|b| mean(b.into_iter()))
     }
 
     fn spread(&self) -> f64 {
@@ -158,6 +178,9 @@ fn row(
             category.n_parts as u32
         };
         let mut run = stream::stream(category, order, n_parts, up, &mut session)?;
+        if let Some(most) = args.proposals {
+            run.proposals = Some(proposals::proposals(category, most, &mut session)?);
+        }
         run.with_exemplars = stream::with_exemplars(category, &counts, &mut session)?;
         let library = session.drain();
         if order + 1 == args.orders {
@@ -225,6 +248,8 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
     .map(str::to_owned)
     .to_vec();
     let others = rows.first().map_or(&[][..], |r| &r.others);
+    let has_proposals = rows.iter().all(|r| r.best_of_proposals().is_some());
+    head.extend(has_proposals.then(|| "best proposal".to_owned()));
     head.extend(exemplars.iter().map(|n| format!("{n} labelled")));
     head.extend(others.iter().map(|o| o.0.to_owned()));
     let mut lines = vec![head];
@@ -242,6 +267,7 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
             format!("{:.3}", mean(r.accuracies().into_iter())),
             format!("{:.3}", r.spread()),
         ];
+        line.extend(r.best_of_proposals().map(|a| format!("{a:.3}")));
         line.extend(r.with_exemplars().iter().map(|a| format!("{a:.3}")));
         line.extend(r.others.iter().map(|o| format!("{:.3}", o.1)));
         lines.push(line);
@@ -254,6 +280,8 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
     let n_right: usize = rows.iter().map(Row::n_right).sum();
     last[4] = format!("{n_right}/{n_runs}");
     last.extend([format!("{streamed:.3}"), format!("{spread:.3}")]);
+    let best: Option<Vec<f64>> = rows.iter().map(Row::best_of_proposals).collect();
+    last.extend(best.map(|b| format!("{:.3}", mean(b.into_iter()))));
     let labelled = |i| mean(rows.iter().map(|r| r.with_exemplars()[i]));
     last.extend((0..exemplars.len()).map(|i| format!("{:.3}", labelled(i))));
     last.extend(
@@ -278,6 +306,7 @@ fn report(rows: &[Row]) -> Value {
                     "seconds": run.seconds,
                     "place_ms": run.place_ms,
                     "with_exemplars": run.with_exemplars,
+                    "proposals": run.proposals.as_ref().map(ProposalScores::report),
                 })
             })
             .collect();
@@ -295,6 +324,7 @@ fn report(rows: &[Row]) -> Value {
             "n_right": r.n_right(),
             "place_ms": r.place_ms(),
             "place_growth": r.place_growth(),
+            "best_of_proposals": r.best_of_proposals(),
             "with_exemplars": r.with_exemplars(),
             "spread_with_exemplars": r.spread_with_exemplars(),
             "orders": runs,

@@ -8,6 +8,7 @@ mod made;
 mod maps;
 mod partial;
 mod print;
+mod proposals;
 mod session;
 mod signatures;
 mod stream;

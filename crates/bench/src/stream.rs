@@ -2,6 +2,7 @@
 //! on them in process.
 
 use crate::error::BenchError;
+use crate::proposals::ProposalScores;
 use crate::session::{COLLECTION, Session};
 use bytes::Bytes;
 use coseg::call;
@@ -62,6 +63,8 @@ pub(crate) struct Run {
     pub(crate) place_ms: Vec<f64>,
     /// Accuracy of the other shapes, for each requested number of shapes labelled by hand.
     pub(crate) with_exemplars: Vec<f64>,
+    /// The proposals, if they are asked for.
+    pub(crate) proposals: Option<ProposalScores>,
     labels: Vec<Option<Vec<i32>>>,
 }
 
@@ -169,7 +172,7 @@ fn shapes(dir: &Path, limit: Option<u32>) -> Result<Vec<Known>, BenchError> {
     Ok(shapes)
 }
 
-fn scored<'a>(
+pub(crate) fn scored<'a>(
     category: &str,
     shapes: impl Iterator<Item = &'a Known>,
     labels: &'a [Option<Vec<i32>>],
@@ -245,6 +248,7 @@ pub(crate) fn stream(
         seconds: begin.elapsed().as_secs_f64(),
         place_ms,
         with_exemplars: Vec::new(),
+        proposals: None,
         labels,
     })
 }

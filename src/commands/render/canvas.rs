@@ -8,7 +8,7 @@ pub(super) const GLYPH: usize = 8;
 
 /// A picture, row by row, sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Canvas {
+pub(in crate::commands) struct Canvas {
     width: usize,
     pixels: Vec<[u8; 3]>,
 }
@@ -75,7 +75,7 @@ impl Canvas {
     }
 
     /// The picture as a PNG file.
-    pub(super) fn png(&self) -> io::Result<Vec<u8>> {
+    pub(in crate::commands) fn png(&self) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
         let size = |n: usize| u32::try_from(n).map_err(io::Error::other);
         let mut encoder = png::Encoder::new(&mut bytes, size(self.width)?, size(self.height())?);

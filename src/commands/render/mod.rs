@@ -33,16 +33,10 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
         shapes.truncate(max);
     }
     let up = about.spec.as_ref().and_then(|s| axis(s.up()));
-    let n_columns = columns(shapes.len());
-    let n_rows = shapes.len().div_ceil(n_columns);
-    let legend = legend(&about.labels);
-    let width = n_columns * (CELL + MARGIN) + MARGIN;
-    let top = MARGIN + LINE * legend_lines(&legend, width);
-    let mut sheet = Canvas::new(width, top + n_rows * (CELL + LINE + MARGIN) + MARGIN);
-    draw_legend(&mut sheet, &legend);
     let progress = bar(shapes.len() as u64);
     let styles = styles(&about.labels);
-    for (i, shape) in shapes.iter().enumerate() {
+    let mut cells = Vec::with_capacity(shapes.len());
+    for shape in &shapes {
         progress.set_message(shape.name.clone());
         let request = wire::GetLabelsRequest {
             collection: collection.clone(),
@@ -54,13 +48,14 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
         let original = Original::receive(&mut session, &collection, &shape.name)?;
         let mesh = original.mesh(&shape.name, found.len())?;
         let colours: Vec<[u8; 3]> = found.iter().map(|&l| colour(l, &styles)).collect();
-        let x = MARGIN + i % n_columns * (CELL + MARGIN);
-        let y = top + i / n_columns * (CELL + LINE + MARGIN);
-        sheet.put(x, y, &picture(&mesh, &colours, up));
-        sheet.text(x, y + CELL + 2, &fitting(&shape.name, CELL), [40; 3]);
+        cells.push(Cell {
+            name: shape.name.clone(),
+            picture: picture(&mesh, &colours, up),
+        });
         progress.inc(1);
     }
     progress.finish_and_clear();
+    let sheet = contact_sheet(&legend(&about.labels), &cells);
     let file = |source| CommandError::File {
         path: args.out.display().to_string(),
         source,
@@ -81,8 +76,35 @@ pub(crate) fn run(args: &Render, mut session: Session) -> Outcome {
     Ok(true)
 }
 
+/// A picture of a shape, and its name.
+pub(in crate::commands) struct Cell {
+    pub(in crate::commands) name: String,
+    pub(in crate::commands) picture: Canvas,
+}
+
+/// Draws shapes side by side, below a legend: text and colour of each entry.
+pub(in crate::commands) fn contact_sheet(legend: &[(String, [u8; 3])], cells: &[Cell]) -> Canvas {
+    let n_columns = columns(cells.len());
+    let n_rows = cells.len().div_ceil(n_columns);
+    let width = n_columns * (CELL + MARGIN) + MARGIN;
+    let top = MARGIN + LINE * legend_lines(legend, width);
+    let mut sheet = Canvas::new(width, top + n_rows * (CELL + LINE + MARGIN) + MARGIN);
+    draw_legend(&mut sheet, legend);
+    for (i, cell) in cells.iter().enumerate() {
+        let x = MARGIN + i % n_columns * (CELL + MARGIN);
+        let y = top + i / n_columns * (CELL + LINE + MARGIN);
+        sheet.put(x, y, &cell.picture);
+        sheet.text(x, y + CELL + 2, &fitting(&cell.name, CELL), [40; 3]);
+    }
+    sheet
+}
+
 /// One shape in the colours of its polygons.
-fn picture(mesh: &ParsedMesh, colours: &[[u8; 3]], up: Option<[f64; 3]>) -> Canvas {
+pub(in crate::commands) fn picture(
+    mesh: &ParsedMesh,
+    colours: &[[u8; 3]],
+    up: Option<[f64; 3]>,
+) -> Canvas {
     let view = View::new(&mesh.vertices, up);
     let corners = mesh
         .triangles
@@ -171,7 +193,7 @@ fn fitting(name: &str, width: usize) -> String {
     format!("{kept}..")
 }
 
-fn axis(up: wire::Up) -> Option<[f64; 3]> {
+pub(super) fn axis(up: wire::Up) -> Option<[f64; 3]> {
     Some(match up {
         wire::Up::PlusX => [1.0, 0.0, 0.0],
         wire::Up::MinusX => [-1.0, 0.0, 0.0],

@@ -51,6 +51,16 @@ pub(super) fn compute(library: &Library, compute: Compute, sent: &[Bytes]) -> An
             let question = library.next_question(&r.collection, r.passed);
             Reply::NextQuestion(convert::question(&question.map_err(refused)?, &mut frames))
         }
+        Compute::ListProposals(r) => {
+            let proposals = library.proposals(&r.collection).map_err(refused)?;
+            Reply::ListProposals(convert::proposals(&proposals))
+        }
+        Compute::GetProposal(r) => {
+            let labels = library
+                .proposed_labels(&r.collection, r.n)
+                .map_err(refused)?;
+            Reply::GetProposal(convert::proposed_labels(&labels, &mut frames))
+        }
     };
     Ok((result, frames.finish()))
 }
@@ -110,6 +120,10 @@ pub(super) fn edit(
                 .map_err(refused)?;
             let label = Some(convert::label_info(&label));
             Reply::SplitLabel(wire::SplitLabelReply { label, n_shapes })
+        }
+        Edit::ChooseProposal(r) => {
+            let done = library.choose(&r.collection, r.n, &r.set, key);
+            Reply::ChooseProposal(convert::chosen(&done.map_err(refused)?))
         }
         Edit::Undo(r) => {
             let undone = library.undo(&r.collection, key).map_err(refused)?;

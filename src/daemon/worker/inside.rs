@@ -262,7 +262,7 @@ fn carry_out(library: &Library, bytes: Vec<u8>, max_bytes: u64, poisoned: bool) 
     Ok((result, frames))
 }
 
-/// Places or relabels a shape, and returns the report.
+/// Places or relabels a shape, or makes a step towards proposals, and returns the report.
 fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
     let placed = catch_unwind(AssertUnwindSafe(|| {
         let library = opened(header, open)?;
@@ -270,6 +270,9 @@ fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
             let most = header["most"].as_u64().unwrap_or(1) as usize;
             let n_shapes = library.relabel_batch(Some(collection), most)?;
             return Ok(report::relabelled(n_shapes));
+        }
+        if let Some(collection) = header["propose"].as_str() {
+            return Ok(report::proposed(library.propose_next(collection)?));
         }
         let ticket = &header["place"];
         if poisoned {

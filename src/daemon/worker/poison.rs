@@ -31,9 +31,13 @@ pub(super) fn named_shapes(work: &Remote) -> Vec<&str> {
         Remote::Compute(Compute::GetPortraits(r)) => r.shapes.iter().map(String::as_str).collect(),
         Remote::Edit(Edit::CorrectLabels(r)) => vec![&r.shape],
         Remote::Edit(Edit::RemoveShape(r)) => vec![&r.shape],
-        Remote::Compute(Compute::SuggestNext(_) | Compute::NextQuestion(_)) | Remote::Edit(_) => {
-            Vec::new()
-        }
+        Remote::Compute(
+            Compute::SuggestNext(_)
+            | Compute::NextQuestion(_)
+            | Compute::ListProposals(_)
+            | Compute::GetProposal(_),
+        )
+        | Remote::Edit(_) => Vec::new(),
     }
 }
 

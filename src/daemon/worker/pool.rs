@@ -33,12 +33,16 @@ pub(crate) enum Placing<'a> {
     Place(&'a Value, u64),
     /// Relabel at most so many stale shapes of a collection.
     Relabel(&'a str, usize),
+    /// Make a step towards the proposals of a collection.
+    Propose(&'a str),
 }
 
 /// Workers that wait for work.
 pub(crate) struct Pool {
     describing: Mutex<Vec<Process>>,
     placing: Mutex<Idle>,
+    /// Apart from those that place, since they are ended as soon as anything else is to be done.
+    proposing: Mutex<Idle>,
     /// These have the priority of the daemon; the others have a lower one.
     answering: Mutex<Idle>,
     library: PathBuf,
@@ -65,6 +69,7 @@ impl Pool {
         let pool = Self {
             describing: Mutex::default(),
             placing: Mutex::default(),
+            proposing: Mutex::default(),
             answering: Mutex::default(),
             library: library.to_path_buf(),
             n_workers: n_workers.max(1),
@@ -80,6 +85,7 @@ impl Pool {
     pub(crate) fn close(&self) {
         locked(&self.describing).clear();
         locked(&self.placing).clear();
+        locked(&self.proposing).clear();
         locked(&self.answering).clear();
     }
 
@@ -145,8 +151,8 @@ impl Pool {
         Ok(outcome)
     }
 
-    /// Places or relabels in a worker. The caller has exclusive use of the collection in this
-    /// process.
+    /// Places, relabels or proposes in a worker. To place or relabel, the caller has exclusive use
+    /// of the collection in this process.
     pub(crate) fn place(
         &self,
         collection: &str,
@@ -155,6 +161,10 @@ impl Pool {
     ) -> Result<Value, Ended> {
         let mut header = json!({ "library": self.library, "prepared": self.prepared_bytes });
         let mut memory = PLACE_MEMORY;
+        let idle = match work {
+            Placing::Propose(_) => &self.proposing,
+            _ => &self.placing,
+        };
         match work {
             Placing::Place(ticket, n_bytes) => {
                 header["place"] = ticket.clone();
@@ -166,13 +176,14 @@ impl Pool {
                 header["relabel"] = json!(collection);
                 header["most"] = json!(most);
             }
+            Placing::Propose(collection) => header["propose"] = json!(collection),
         }
         let work = Work {
             header,
             bytes: &[],
             memory,
         };
-        let outcome = self.run_with_library(&self.placing, collection, &work, wanted)?;
+        let outcome = self.run_with_library(idle, collection, &work, wanted)?;
         serde_json::from_slice(&outcome).map_err(|e| Ended::died(e.to_string()))
     }
 

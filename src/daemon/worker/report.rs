@@ -16,6 +16,8 @@ pub(crate) enum Outcome {
     State(ItemState),
     /// How many stale shapes were relabelled.
     Relabelled(u64),
+    /// Whether a step towards proposals was made.
+    Proposed(bool),
     /// The library refused or failed.
     Failed(Failure),
 }
@@ -38,6 +40,11 @@ pub(super) fn placed(state: &ItemState) -> Value {
 /// The report of how many shapes were relabelled.
 pub(super) fn relabelled(n_shapes: usize) -> Value {
     json!({ "relabelled": n_shapes })
+}
+
+/// The report of whether a step towards proposals was made.
+pub(super) fn proposed(was_made: bool) -> Value {
+    json!({ "proposed": was_made })
 }
 
 /// The report of a panic.
@@ -67,6 +74,8 @@ pub(crate) fn read_report(report: &Value) -> Result<Report, String> {
     Ok(Report::Outcome(
         if let Some(n_shapes) = report["relabelled"].as_u64() {
             Outcome::Relabelled(n_shapes)
+        } else if let Some(was_made) = report["proposed"].as_bool() {
+            Outcome::Proposed(was_made)
         } else if let Some(text) = text("panic") {
             Outcome::Failed(panicked(&text))
         } else if let Some(failure) = report.get("error") {

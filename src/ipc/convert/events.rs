@@ -83,6 +83,15 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
             from: from.clone(),
             to: to.clone(),
         }),
+        EventKind::Chosen {
+            proposal,
+            n_labels,
+            value,
+        } => Kind::Chosen(wire::Chosen {
+            proposal: *proposal,
+            n_labels: *n_labels,
+            value: *value,
+        }),
         EventKind::Reclustered {
             score_before,
             score_after,

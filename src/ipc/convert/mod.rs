@@ -7,6 +7,7 @@ mod corrections;
 mod errors;
 mod events;
 mod jobs;
+mod proposals;
 mod questions;
 mod shapes;
 
@@ -30,5 +31,6 @@ pub use jobs::{
     Ingest, ShapeInput, Source, add_shapes, carrying_job, format_from_wire, item, job_finished,
     mesh_format, new_shapes,
 };
+pub use proposals::{chosen, proposals, proposed_labels};
 pub use questions::{answer, answered, question, review, wanted_review};
 pub use shapes::{clean_report, labels, labels_snapshot, original, shape};

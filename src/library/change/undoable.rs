@@ -15,6 +15,7 @@ pub(in crate::library) enum Undoable {
     Merge { label: LabelId, into: LabelId },
     Split { label: LabelId, new: LabelId },
     Up { from: String, to: String },
+    Choose { proposal: u32 },
 }
 
 impl Undoable {
@@ -29,6 +30,7 @@ impl Undoable {
             Self::Merge { .. } => "merge",
             Self::Split { .. } => "split",
             Self::Up { .. } => "up",
+            Self::Choose { .. } => "choose",
         }
     }
 
@@ -43,6 +45,7 @@ impl Undoable {
             Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
             Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
             Self::Up { from, to } => serde_json::json!({ "from": from, "to": to }),
+            Self::Choose { proposal } => serde_json::json!({ "proposal": proposal }),
         };
         to_json(&detail)
     }

@@ -129,8 +129,13 @@ pub(in crate::library) fn label_new(
     Ok(Some(Voted::new(labelling, &voters, maps)))
 }
 
-/// Returns whether the addition of one more shape clusters the collection again.
+/// Returns whether the addition of one more shape clusters the collection again. It does not once
+/// a person has chosen a proposal.
 pub(in crate::library) fn is_due(collection: &Collection) -> bool {
+    collection.state().chosen.is_none() && has_grown(collection)
+}
+
+fn has_grown(collection: &Collection) -> bool {
     collection.shapes().len() as u64 + 1 >= collection.state().next_recluster
 }
 
@@ -159,12 +164,18 @@ fn grown(
     shape: FileView<'_>,
 ) -> Plan {
     let mut model = model.clone();
+    let mut state = collection.state().clone();
+    if has_grown(collection) && state.chosen.is_some() {
+        // New proposals are made, but none of them is accepted by itself.
+        state.next_recluster = next_recluster(collection.shapes().len() as u64 + 1);
+        state.clustered = Some(collection.row().next_ordinal);
+    }
     let prepared = sources.prepared(shape, &model.model);
     let statistics = labelling.statistics(&prepared, model.model.labels.len());
     model.model.statistics.accumulate(&statistics, 1.0);
     Plan {
         model,
-        state: collection.state().clone(),
+        state,
         labelling,
         relabelled: Vec::new(),
         changes: Vec::new(),
@@ -198,6 +209,7 @@ fn reclustered(
         // its beginning, whether that happens before or after this addition.
         let mut plan = grown(collection, sources, model, labelling, new.arrays);
         plan.state.next_recluster = next_recluster;
+        plan.state.clustered = Some(collection.row().next_ordinal);
         plan.state.up_disagrees = found.up.disagrees;
         plan.reclustered = Some(event);
         return Ok(plan);
@@ -300,7 +312,7 @@ fn cluster(
     let up = UpFound::of(up, &shapes.iter().map(|s| &s.shape).collect::<Vec<_>>());
     let options = ReclusterOptions {
         discovery: DiscoveryOptions {
-            n_labels: collection.row().n_parts.map(|n| n as usize),
+            n_labels: (collection.state().chosen.or(collection.row().n_parts)).map(|n| n as usize),
             ..DiscoveryOptions::default()
         },
         up: up.axis,
@@ -355,7 +367,10 @@ pub(in crate::library) fn turn(
 ) -> Result<Change> {
     let found = cluster(collection, sources, up, f64::NEG_INFINITY, None)?;
     let next = next_recluster(collection.shapes().len() as u64);
-    let state = found.epoch(collection, next, collection.row().next_ordinal - 1, None);
+    let state = State {
+        chosen: collection.state().chosen,
+        ..found.epoch(collection, next, collection.row().next_ordinal - 1, None)
+    };
     let closing = Some(found.event(true));
     let model = found.outcome.model;
     let mut relabelled = Vec::new();

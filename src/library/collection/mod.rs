@@ -6,6 +6,7 @@
 //! changes a collection: its fields are private, and [`Collection::apply`] and
 //! [`Collection::set_aside`] are the only methods with `&mut self`.
 
+pub(super) mod chosen;
 pub(super) mod discovered;
 pub(super) mod fit;
 mod model_state;

@@ -18,9 +18,19 @@ pub(in crate::library) struct State {
     pub(in crate::library) up_disagrees: Option<UpState>,
     /// The newest job that propagates a correction.
     pub(in crate::library) propagation: Option<Propagation>,
+    /// The newest ordinal when clustering was last due, if the epoch did not begin then.
+    pub(in crate::library) clustered: Option<u64>,
+    /// Number of labels of the proposal that a person chose. Its labels stay until a person changes
+    /// them: clustering makes new proposals only.
+    pub(in crate::library) chosen: Option<u32>,
 }
 
 impl State {
+    /// Returns the newest ordinal when clustering was last due; 0 before the first time.
+    pub(in crate::library) fn clustered_ordinal(&self) -> u64 {
+        self.clustered.unwrap_or(self.epoch.last_ordinal)
+    }
+
     /// Returns the same state with the evidence of shapes about the up axis.
     pub(in crate::library) fn with_up(self, found: &UpFound) -> Self {
         Self {

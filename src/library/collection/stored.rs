@@ -24,6 +24,10 @@ pub(in crate::library) struct StoredState {
     up_disagrees: Option<UpState>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     carrying: Option<StoredPropagation>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    clustered: Option<u64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    chosen: Option<u32>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -78,6 +82,8 @@ impl From<StoredState> for State {
                 job: c.job,
                 n_shapes: c.n_shapes,
             }),
+            clustered: stored.clustered,
+            chosen: stored.chosen,
         }
     }
 }
@@ -96,6 +102,8 @@ impl From<State> for StoredState {
                 job: p.job,
                 n_shapes: p.n_shapes,
             }),
+            clustered: state.clustered,
+            chosen: state.chosen,
         }
     }
 }
@@ -153,7 +161,7 @@ mod tests {
                     r#"{"next_recluster":7,"representatives":[1],"epoch_ordinal":1,"silent":[],"#,
                     r#""teaching":{"pending":true,"normalised":false,"closed":true,"#,
                     r#""taught":[1,2],"discovered":[[1,3]],"discovered_labels":[0,2]},"#,
-                    r#""carrying":{"job":9,"n_shapes":4}}"#,
+                    r#""carrying":{"job":9,"n_shapes":4},"clustered":6,"chosen":3}"#,
                 ),
                 false,
             ),

@@ -11,6 +11,7 @@ mod jobs;
 mod labels;
 pub(in crate::store) mod log;
 mod maps;
+mod proposals;
 mod reader;
 mod reviews;
 pub(crate) mod schema;

@@ -11,7 +11,7 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are rejected.
-pub const CATALOG_FORMAT: u32 = 4;
+pub const CATALOG_FORMAT: u32 = 5;
 
 /// The format before corrections: it lacks the tables in [`SINCE_FORMAT_2`].
 const WITHOUT_CORRECTIONS: u32 = 1;
@@ -22,6 +22,9 @@ const WITHOUT_CONFIDENCE: u32 = 2;
 
 /// The format before verdicts of persons: it lacks the tables in [`SINCE_FORMAT_4`].
 const WITHOUT_REVIEWS: u32 = 3;
+
+/// The format before proposals: it lacks the tables in [`SINCE_FORMAT_5`].
+const WITHOUT_PROPOSALS: u32 = 4;
 
 /// `cseg`, the application id in the header of the SQLite file.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -176,6 +179,16 @@ tables! {
     "shape_id INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part INTEGER NOT NULL,
      why TEXT NOT NULL, sum INTEGER, PRIMARY KEY (shape_id, part)"
 
+    CANDIDATES "candidates" key 2 ["collection_id", "n_labels", "basis", "found"]
+    "collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE,
+     n_labels INTEGER NOT NULL, basis TEXT NOT NULL, found BLOB NOT NULL, sum INTEGER,
+     PRIMARY KEY (collection_id, n_labels)"
+
+    PROPOSALS "proposals" key 2 ["collection_id", "n", "basis", "n_labels", "value", "labels"]
+    "collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE, n INTEGER NOT NULL,
+     basis TEXT NOT NULL, n_labels INTEGER NOT NULL, value REAL NOT NULL, labels BLOB NOT NULL,
+     sum INTEGER, PRIMARY KEY (collection_id, n)"
+
     LABELS_BEFORE "labels_before" key 2 [
         "correction_id", "shape_id", "version", "label_epoch", "parts", "area_shares",
     ]
@@ -242,6 +255,9 @@ const INDEXES_SINCE_FORMAT_3: &str = "
 
 /// Tables that format 4 added.
 const SINCE_FORMAT_4: [&Table; 2] = [&REVIEWS, &PASSED_PARTS];
+
+/// Tables that format 5 added.
+const SINCE_FORMAT_5: [&Table; 2] = [&CANDIDATES, &PROPOSALS];
 
 const INDEXES: &str = "
     CREATE INDEX stale_shapes ON shapes (collection_id, ordinal) WHERE stale;
@@ -315,7 +331,7 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     let found = pragma("user_version")?;
     let is_old = matches!(
         found,
-        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS
+        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS | WITHOUT_PROPOSALS
     );
     if pragma("application_id")? != APPLICATION_ID || !is_old {
         return Ok(());
@@ -333,7 +349,12 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
         }
         tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
     }
-    for table in SINCE_FORMAT_4 {
+    if found < WITHOUT_PROPOSALS {
+        for table in SINCE_FORMAT_4 {
+            tx.execute_batch(&table.create())?;
+        }
+    }
+    for table in SINCE_FORMAT_5 {
         tx.execute_batch(&table.create())?;
     }
     tx.execute(

@@ -307,6 +307,8 @@ function labelEvent(e, app) {
       return { text: `${e.change} undone`, person: true };
     case "up_changed":
       return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
+    case "chosen":
+      return { text: `proposal ${e.proposal} chosen, ${e.n_labels} labels`, person: true };
     default:
       return null;
   }

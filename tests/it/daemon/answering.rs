@@ -93,6 +93,8 @@ fn what_poisons_an_answer_costs_that_request_alone() {
     let job = add(client, "c", &shapes);
     assert!(job.items.iter().all(|i| i.error.is_none()), "{job:?}");
     wait_idle(client, "c");
+    // Nothing remains to be done in the background.
+    super::proposals(client, "c");
     drop(daemon);
     // The limit is set only now, since describing takes long on a busy machine.
     let env = [(POISON_VARIABLE, "1"), ("COSEG__WORK__SHAPE_SECONDS", "8")];

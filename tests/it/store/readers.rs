@@ -102,20 +102,25 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
             .execute_batch(sql)
             .expect("runs");
     };
+    let since_5 = "DROP TABLE candidates; DROP TABLE proposals;";
     let since_4 = "DROP TABLE reviews; DROP TABLE passed_parts;";
     let since_3 = "DROP TABLE point_maps; DROP TABLE map_confidence;";
     let since_2 = "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;";
+    old(&format!("{since_5} PRAGMA user_version = 4"));
+    drop(Store::open(&library)?);
+    assert_eq!(format(), 5);
+    let since_4 = format!("{since_5} {since_4}");
     old(&format!("{since_4} PRAGMA user_version = 3"));
     drop(Store::open(&library)?);
-    assert_eq!(format(), 4);
+    assert_eq!(format(), 5);
     old(&format!("{since_4} {since_3} PRAGMA user_version = 2"));
     drop(Store::open(&library)?);
-    assert_eq!(format(), 4);
+    assert_eq!(format(), 5);
     old(&format!(
         "{since_4} {since_3} {since_2} PRAGMA user_version = 1"
     ));
     let store = Store::open(&library)?;
-    assert_eq!(format(), 4);
+    assert_eq!(format(), 5);
     let new = coseg::store::NewCollection {
         name: "old".into(),
         ..Default::default()
@@ -139,14 +144,14 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 5");
+    change("PRAGMA user_version = 6");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 5,
-                supported: 4,
+                found: 6,
+                supported: 5,
                 ..
             }
         ),

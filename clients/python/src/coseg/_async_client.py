@@ -633,7 +633,7 @@ class AsyncCollection:
         return found[0]
 
     async def undo(self) -> t.Undone:
-        """Takes back the newest correction, name, merge, split or change of the up axis."""
+        """Takes back the newest correction, name, merge, split, change of the up axis or choice."""
         reply, _ = await self._call("undo")
         return wire.flat(t.Undone, reply)
 
@@ -691,6 +691,25 @@ class AsyncCollection:
                 return None
             raise
         return wire.flat(t.Suggestion, reply)
+
+    async def proposals(self) -> t.Proposals:
+        """Divisions of the shapes into labels, from coarse to fine, of which :meth:`choose` makes one
+        the labels. They are made in the background: ``n_steps`` is 0 once they are those for the
+        present labels."""
+        reply, _ = await self._call("list_proposals")
+        return wire.proposals(reply)
+
+    async def proposed_labels(self, n: int) -> dict[str, t.Int32]:
+        """The class of each face of each shape in proposal ``n``, by the names of the shapes that it
+        divides, at most 40. Classes become label ids when it is chosen."""
+        reply, raw = await self._call("get_proposal", n=n)
+        return {found.shape: raw.array(found.labels) for found in reply.shapes}
+
+    async def choose(self, n: int, *, set: str = "") -> t.Chosen:
+        """Makes proposal ``n`` the labels; all shapes follow, and :meth:`undo` restores the labels
+        before. ``set``, if given, must be that of the present proposals."""
+        reply, _ = await self._call("choose_proposal", n=n, set=set)
+        return wire.flat(t.Chosen, reply)
 
     # -- events ---------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from coseg.v1 import (
     job_pb2,
     message_pb2,
     portrait_pb2,
+    proposal_pb2,
     question_pb2,
     review_pb2,
     shape_pb2,
@@ -241,6 +242,12 @@ def question(reply: question_pb2.NextQuestionReply, raw: Raw) -> t.Question:
         faces=raw.array(reply.faces),
         likeliest=tuple(flat(t.OfferedLabel, label) for label in reply.likeliest),
     )
+
+
+def proposals(reply: proposal_pb2.ListProposalsReply) -> t.Proposals:
+    """The proposals of a collection."""
+    found = tuple(flat(t.Proposal, proposal) for proposal in reply.proposals)
+    return flat(t.Proposals, reply, proposals=found)
 
 
 def answered(reply: question_pb2.AnswerQuestionReply) -> t.Answered:

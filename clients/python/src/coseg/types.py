@@ -486,13 +486,53 @@ class Corrected:
 @dataclass(frozen=True)
 class Undone:
     """What was undone: ``"correct"``, ``"answer"``, ``"approve"``, ``"doubt"``, ``"name"``,
-    ``"merge"``, ``"split"`` or ``"up"``."""
+    ``"merge"``, ``"split"``, ``"up"`` or ``"choose"``."""
 
     change: str
-    #: What it changed: a shape, a label or an axis.
+    #: What it changed: a shape, a label, an axis or a proposal.
     subject: str
     #: Changes that can still be undone.
     n_left: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A division of the shapes of a collection into labels, which a person can choose."""
+
+    #: From 1, coarse to fine.
+    n: int
+    n_labels: int
+    #: Its value among divisions with as many labels; higher is better.
+    value: float
+    #: Whether it is the labels in force.
+    in_force: bool
+    #: 1 minus the normalised mutual information with the labels in force; 0: the same division.
+    differs: float
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """The proposals of a collection."""
+
+    #: From coarse to fine; while new ones are made, the previous ones.
+    proposals: tuple[Proposal, ...]
+    #: Distinguishes them from those made before or later.
+    set: str
+    #: Steps of making new ones, and how many of them are done; both 0 if none are made.
+    n_steps: int
+    n_done: int
+    #: Shapes that they divide.
+    n_shapes: int
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What choosing a proposal did."""
+
+    n_labels: int
+    #: Shapes whose labels still follow from it.
+    n_stale: int
     sequence: int
 
 
