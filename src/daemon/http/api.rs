@@ -484,6 +484,7 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
         shape: correction.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
         by: String::new(),
+        closed: None,
     };
     let (done, _) = request!(server, CorrectLabels(request), Some(frames))?;
     json_of(server, move || json::corrected(&done)).await
