@@ -22,6 +22,12 @@ pub(crate) struct Correct {
     /// The label of that part: an id, or the name of an existing label
     #[arg(long, value_name = "LABEL", requires = "part")]
     pub(crate) label: Option<String>,
+    /// There are no labels but those that persons used, so every face gets one of these
+    #[arg(long, conflicts_with = "open")]
+    pub(crate) closed: bool,
+    /// Discovered labels that no labelled shape shows are labels too, as they are without --closed
+    #[arg(long)]
+    pub(crate) open: bool,
     #[command(flatten)]
     pub(crate) person: Person,
     /// Return once the correction is durable, before it has been propagated to the other shapes

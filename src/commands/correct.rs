@@ -45,6 +45,11 @@ pub(crate) fn run(args: &Correct, mut session: Session) -> Outcome {
         shape: args.shape.clone(),
         correction: Some(correction),
         by: args.person.name(),
+        closed: match (args.closed, args.open) {
+            (true, _) => Some(true),
+            (_, true) => Some(false),
+            (false, false) => None,
+        },
     };
     let frames: Vec<Bytes> = frames.finish();
     let begin = Instant::now();

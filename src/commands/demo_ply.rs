@@ -134,6 +134,8 @@ mod tests {
             colour_rgb: 0x01_02_03,
             merged_into: None,
             n_shapes: 1,
+            area_share: 1.0,
+            unclaimed: false,
         }];
         let files = files(&[(&a, &[5]), (&b, &[-1])], &infos);
         let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();

@@ -94,6 +94,8 @@ mod tests {
             colour_rgb: 0x01_02_ff,
             merged_into: None,
             n_shapes: 1,
+            area_share: 1.0,
+            unclaimed: false,
         };
         let styles = styles(&[info(7, "long leg"), info(8, "")]);
         let names: Vec<(i32, &str)> = styles.iter().map(|(l, s)| (*l, s.name.as_str())).collect();

@@ -69,7 +69,7 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
         c.sequence
     ))?;
     let mut rows = vec![
-        ["label", "name", "colour", "state"]
+        ["label", "name", "colour", "area", "state"]
             .map(str::to_owned)
             .to_vec(),
     ];
@@ -79,13 +79,25 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
             l.id.to_string(),
             l.name.clone(),
             json::colour(l.colour_rgb),
+            format!("{:.1} %", 100.0 * l.area_share),
             state.unwrap_or_else(|| match l.n_shapes {
                 0 => "out of use".to_owned(),
+                n if l.unclaimed => format!("on {}, unclaimed", counted(n, "shape")),
                 n => format!("on {}", counted(n, "shape")),
             }),
         ]);
     }
     session.line(&table(&rows))?;
+    let unclaimed = c.labels.iter().filter(|l| l.unclaimed && l.n_shapes > 0);
+    let area: f64 = unclaimed.clone().map(|l| l.area_share).sum();
+    if let n @ 1.. = unclaimed.count() as u64 {
+        session.line(&format!(
+            "{:.1} % of the area has {} that no labelled shape shows: name, merge or label them, or \
+             say `coseg correct --closed` if there are no such parts",
+            100.0 * area,
+            counted(n, "discovered label")
+        ))?;
+    }
     Ok(true)
 }
 

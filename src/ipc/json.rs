@@ -54,6 +54,8 @@ pub fn label(l: &wire::LabelInfo) -> Value {
         "colour": colour(l.colour_rgb),
         "merged_into": l.merged_into,
         "n_shapes": l.n_shapes,
+        "area_share": l.area_share,
+        "unclaimed": l.unclaimed,
     })
 }
 

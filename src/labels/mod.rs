@@ -28,7 +28,7 @@ pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};
 pub use model::{Classifier, LabelModel, Statistics};
-pub use prior::{Pinned, PriorLabels};
+pub use prior::{Overlap, Pinned, PriorLabels};
 pub use propose::{
     Candidate, N_PROPOSALS, PROPOSED_LABELS, Proposal, agreement, candidates, propose,
 };

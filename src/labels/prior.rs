@@ -1,5 +1,5 @@
-//! Labels that were discovered before a person labelled faces: what they mean in the person's
-//! labels, and how well the two agree.
+//! Labels that were discovered before a person labelled faces: which of them labelled faces show,
+//! what these mean in the person's labels, and how well the two agree.
 
 use super::cut::{STRENGTH, cut};
 use super::{Features, Statistics};
@@ -8,6 +8,12 @@ use crate::segmentation::Surface;
 /// Share of a shape's area that is added to the observed meaning of a label, spread over all
 /// classes.
 const UNSEEN_AREA: f64 = 0.05;
+
+/// Share of the area that a discovered label covers on labelled shapes, relative to its mean over
+/// all shapes, from which on labelled faces show it.
+const SHOWN: f64 = 0.2;
+/// Mean share of a shape's area below which a discovered label is too small to be kept.
+const LEAST_KEPT: f64 = 0.02;
 
 /// A shape with faces that a person labelled.
 #[derive(Debug, Clone, Copy)]
@@ -18,6 +24,57 @@ pub struct Pinned<'a> {
     pub features: &'a Features,
     /// Class of each face `(m,)`; `None` where the person gave no label.
     pub classes: &'a [Option<u32>],
+}
+
+/// Faces that have both a discovered label and a person's.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Overlap {
+    /// Area of each class in each discovered label `(n, k)`, row-major; that of a shape is 1.
+    area: Vec<f64>,
+    /// Largest share of a shape's area that each discovered label has on labelled faces `(n,)`.
+    most: Vec<f64>,
+    n_classes: usize,
+}
+
+impl Overlap {
+    /// Compares the labels with these statistics and the `k` classes of a person on some shapes.
+    /// Costs a cut for each of the shapes.
+    pub fn new<'a>(
+        statistics: &Statistics,
+        pinned: impl Iterator<Item = Pinned<'a>>,
+        k: usize,
+    ) -> Self {
+        let n = statistics.counts.len();
+        let (mut area, mut most) = (vec![0.0; n * k], vec![0.0_f64; n]);
+        for shape in pinned {
+            let labels = most_likely(statistics, shape.surface, shape.features);
+            let faces = labels.iter().zip(shape.classes).zip(&shape.surface.area);
+            let mut here = vec![0.0; n];
+            for ((label, class), face_area) in faces {
+                if let Some(class) = class {
+                    area[*label as usize * k + *class as usize] += face_area;
+                    here[*label as usize] += face_area;
+                }
+            }
+            most.iter_mut().zip(&here).for_each(|(m, h)| *m = m.max(*h));
+        }
+        Self {
+            area,
+            most,
+            n_classes: k,
+        }
+    }
+
+    /// Returns which discovered labels no labelled face shows, of those that are large enough to be
+    /// kept: indices into the labels with these statistics, over `n_shapes` shapes, ascending.
+    pub fn not_shown(&self, statistics: &Statistics, n_shapes: usize) -> Vec<usize> {
+        let mean = |label: usize| statistics.counts[label] / n_shapes.max(1) as f64;
+        let is_kept = |label: &usize| {
+            let mean = mean(*label);
+            mean >= LEAST_KEPT && self.most[*label] < SHOWN * mean
+        };
+        (0..self.most.len()).filter(is_kept).collect()
+    }
 }
 
 /// Discovered labels with their meaning in a person's classes.
@@ -33,33 +90,29 @@ pub struct PriorLabels {
 }
 
 impl PriorLabels {
-    /// Estimates the meaning of the labels with these statistics in `k` classes, from the faces of
-    /// some shapes that have both, by area. Costs a cut for each of the shapes.
-    pub fn new<'a>(
-        statistics: Statistics,
-        pinned: impl Iterator<Item = Pinned<'a>>,
-        k: usize,
-    ) -> Self {
-        let n = statistics.counts.len();
-        let mut both = vec![0.0; n * k];
-        for shape in pinned {
-            let labels = most_likely(&statistics, shape.surface, shape.features);
-            let faces = labels.iter().zip(shape.classes).zip(&shape.surface.area);
-            for ((label, class), area) in faces {
-                if let Some(class) = class {
-                    both[*label as usize * k + *class as usize] += area;
-                }
+    /// Estimates the meaning of the labels with these statistics from the faces that have both. It
+    /// is in `k` classes, those of the person first. Each label in `own` means the class beside it
+    /// and nothing else.
+    pub fn new(statistics: Statistics, both: &Overlap, own: &[(usize, u32)], k: usize) -> Self {
+        let n_given = both.n_classes;
+        let mut meaning = Vec::with_capacity(statistics.counts.len() * k);
+        let mut agreed = 0.0;
+        for (label, row) in both.area.chunks_exact(n_given.max(1)).enumerate() {
+            let start = meaning.len();
+            meaning.resize(start + k, 0.0);
+            if let Some((_, class)) = own.iter().find(|(l, _)| *l == label) {
+                meaning[start + *class as usize] = 1.0;
+                continue;
+            }
+            let total: f64 = row.iter().sum::<f64>() + UNSEEN_AREA;
+            for (class, area) in row.iter().enumerate() {
+                let p = (area + UNSEEN_AREA / n_given as f64) / total;
+                meaning[start + class] = p;
+                agreed += area * p;
             }
         }
-        let meaning = both.chunks_exact(k).flat_map(|row| {
-            let total: f64 = row.iter().sum::<f64>() + UNSEEN_AREA;
-            row.iter()
-                .map(move |area| (area + UNSEEN_AREA / k as f64) / total)
-        });
-        let meaning: Vec<f64> = meaning.collect();
-        let agreed: f64 = both.iter().zip(&meaning).map(|(area, p)| area * p).sum();
         Self {
-            agreement: agreed / both.iter().sum::<f64>().max(1e-300),
+            agreement: agreed / both.area.iter().sum::<f64>().max(1e-300),
             statistics,
             meaning,
         }
@@ -124,7 +177,10 @@ mod tests {
             features: input.shapes[0].features,
             classes,
         };
-        let prior = PriorLabels::new(found.clone(), std::iter::once(shape(&classes)), 2);
+        let of =
+            |found: &Statistics, classes| Overlap::new(found, std::iter::once(shape(classes)), 2);
+        let both = of(&found, &classes);
+        let prior = PriorLabels::new(found.clone(), &both, &[], 2);
         for (row, class) in prior.meaning.chunks(2).zip([1, 1, 0]) {
             assert!((row[0] + row[1] - 1.0).abs() < 1e-12);
             assert!(row[class] > 0.8, "{:?}", prior.meaning);
@@ -139,15 +195,40 @@ mod tests {
         let at_random: Vec<Option<u32>> = (0..strips.truth.len())
             .map(|f| Some(f as u32 % 2))
             .collect();
-        let prior = PriorLabels::new(found, std::iter::once(shape(&at_random)), 2);
+        let prior = PriorLabels::new(found.clone(), &of(&found, &at_random), &[], 2);
         assert!((prior.agreement - 0.5).abs() < 0.05, "{}", prior.agreement);
     }
 
     #[test]
     fn labels_that_nobody_has_seen_may_mean_anything() {
         let (.., found) = seen();
-        let prior = PriorLabels::new(found, std::iter::empty(), 2);
+        let both = Overlap::new(&found, std::iter::empty(), 2);
+        let prior = PriorLabels::new(found, &both, &[], 2);
         assert_eq!(prior.meaning, [0.5; 6]);
         assert_eq!(prior.agreement, 0.0);
+    }
+
+    #[test]
+    fn a_label_that_no_labelled_face_shows_has_a_class_of_its_own() {
+        let (strips, classes, found) = seen();
+        let input = strips.input();
+        // The person labels the first part alone.
+        let first: Vec<Option<u32>> = classes
+            .iter()
+            .zip(&strips.truth)
+            .map(|(_, part)| (*part == 0).then_some(0))
+            .collect();
+        let shape = Pinned {
+            surface: input.shapes[0].surface,
+            features: input.shapes[0].features,
+            classes: &first,
+        };
+        let both = Overlap::new(&found, std::iter::once(shape), 1);
+        let own = both.not_shown(&found, 4);
+        assert_eq!(own, [1, 2]);
+        let prior = PriorLabels::new(found.clone(), &both, &[(1, 1), (2, 2)], 3);
+        assert_eq!(prior.meaning, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+        // Labels that are too small are not worth a class.
+        assert_eq!(both.not_shown(&found, 4_000), [0_usize; 0]);
     }
 }

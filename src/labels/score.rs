@@ -80,36 +80,14 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
     if shapes.is_empty() {
         return Err(ScoreError::Empty);
     }
-    let mut shares = Vec::with_capacity(shapes.len());
-    for (i, shape) in shapes.iter().enumerate() {
-        shares.push(area_shares(i, shape)?);
-    }
-    // One row for each predicted label, one column for each true one.
-    let true_labels: Vec<i32> = distinct(shapes.iter().flat_map(|s| s.truth));
-    let given = shapes.iter().filter_map(|s| s.predicted).flatten();
-    let predicted_labels: Vec<i32> = distinct(given.filter(|&&p| p >= 0));
+    let shares = all_shares(shapes)?;
+    let Overlap {
+        rows: predicted_labels,
+        columns: true_labels,
+        area: overlap,
+    } = Overlap::new(shapes, &shares, |_| true);
     let (n_rows, n_cols) = (predicted_labels.len(), true_labels.len());
-    let row_of: HashMap<i32, usize> = (0..n_rows).map(|i| (predicted_labels[i], i)).collect();
-    let col_of: HashMap<i32, usize> = (0..n_cols).map(|j| (true_labels[j], j)).collect();
-    let mut overlap = vec![0.0; n_rows * n_cols];
-    for (shape, share) in shapes.iter().zip(&shares) {
-        for ((p, t), a) in shape
-            .predicted
-            .unwrap_or(&[])
-            .iter()
-            .zip(shape.truth)
-            .zip(share)
-        {
-            if let Some(i) = row_of.get(p) {
-                overlap[i * n_cols + col_of[t]] += a;
-            }
-        }
-    }
-    let cost: Vec<f64> = overlap.iter().map(|x| -x).collect();
-    let columns = assignment(&cost, n_rows, n_cols);
-    let pairs: BTreeMap<i32, i32> = (0..n_rows)
-        .filter_map(|i| columns[i].map(|j| (predicted_labels[i], true_labels[j])))
-        .collect();
+    let pairs = assigned(&overlap, &predicted_labels, &true_labels);
 
     let n = shapes.len() as f64;
     let per_shape: Vec<f64> = shapes
@@ -144,6 +122,80 @@ pub fn score(shapes: &[ScoredShape<'_>]) -> Result<Score, ScoreError> {
         assignment: pairs.into_iter().collect(),
         shapes: per_shape,
     })
+}
+
+/// Shared area of predicted and true labels.
+struct Overlap {
+    /// The predicted labels, one row each.
+    rows: Vec<i32>,
+    /// The true labels, one column each.
+    columns: Vec<i32>,
+    /// Sum of the area shares that have both, row-major.
+    area: Vec<f64>,
+}
+
+impl Overlap {
+    /// Takes labels into account, predicted ones and true ones alike, for which `counts` holds.
+    /// Negative predicted labels never count.
+    fn new(shapes: &[ScoredShape<'_>], shares: &[Vec<f64>], counts: impl Fn(i32) -> bool) -> Self {
+        let columns = distinct(shapes.iter().flat_map(|s| s.truth).filter(|t| counts(**t)));
+        let given = shapes.iter().filter_map(|s| s.predicted).flatten();
+        let rows: Vec<i32> = distinct(given.filter(|p| **p >= 0 && counts(**p)));
+        let row_of: HashMap<i32, usize> = rows.iter().copied().zip(0..).collect();
+        let col_of: HashMap<i32, usize> = columns.iter().copied().zip(0..).collect();
+        let mut area = vec![0.0; rows.len() * columns.len()];
+        for (shape, share) in shapes.iter().zip(shares) {
+            let labels = shape.predicted.unwrap_or(&[]).iter().zip(shape.truth);
+            for ((p, t), a) in labels.zip(share) {
+                if let (Some(i), Some(j)) = (row_of.get(p), col_of.get(t)) {
+                    area[i * columns.len() + j] += a;
+                }
+            }
+        }
+        Self {
+            rows,
+            columns,
+            area,
+        }
+    }
+}
+
+/// Returns the true label of each predicted one that has one, one to one, so that most area agrees.
+fn assigned(overlap: &[f64], rows: &[i32], columns: &[i32]) -> BTreeMap<i32, i32> {
+    let cost: Vec<f64> = overlap.iter().map(|x| -x).collect();
+    let column_of = assignment(&cost, rows.len(), columns.len());
+    let pairs = rows.iter().zip(column_of);
+    pairs
+        .filter_map(|(row, j)| j.map(|j| (*row, columns[j])))
+        .collect()
+}
+
+/// Returns the mean over shapes of the area share with the right label, where persons gave the
+/// labels `given` and no others. These must *be* the true ones. Predicted labels that no person gave
+/// stand for true labels that no person gave, by one assignment, one to one, that serves all shapes.
+pub fn accuracy_open(shapes: &[ScoredShape<'_>], given: &BTreeSet<i32>) -> Result<f64, ScoreError> {
+    if shapes.is_empty() {
+        return Err(ScoreError::Empty);
+    }
+    let shares = all_shares(shapes)?;
+    let unnamed = Overlap::new(shapes, &shares, |label| !given.contains(&label));
+    let meaning = assigned(&unnamed.area, &unnamed.rows, &unnamed.columns);
+    let is_right = |p: &i32, t: &i32| match given.contains(p) {
+        true => p == t,
+        false => meaning.get(p) == Some(t),
+    };
+    let mut sum = 0.0;
+    for (shape, share) in shapes.iter().zip(&shares) {
+        let labels = shape.predicted.unwrap_or(&[]).iter().zip(shape.truth);
+        let right = labels.zip(share).filter(|((p, t), _)| is_right(p, t));
+        sum += right.map(|(_, a)| a).sum::<f64>();
+    }
+    Ok(sum / shapes.len() as f64)
+}
+
+fn all_shares(shapes: &[ScoredShape<'_>]) -> Result<Vec<Vec<f64>>, ScoreError> {
+    let shares = shapes.iter().enumerate();
+    shares.map(|(i, shape)| area_shares(i, shape)).collect()
 }
 
 /// Returns the mean over shapes of the area share whose predicted label *is* the true one, without
@@ -267,7 +319,9 @@ fn root(parent: &mut [usize], mut i: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::{ScoreError, ScoredShape, accuracy_by_id, pieces, rand_error, score};
+    use super::{
+        ScoreError, ScoredShape, accuracy_by_id, accuracy_open, pieces, rand_error, score,
+    };
     use crate::mesh::TriMesh;
 
     const TOLERANCE: f64 = 1e-12;
@@ -294,6 +348,27 @@ mod tests {
         let mesh = strip(&[1.0, 3.0]);
         assert_eq!(mesh.vertices.len(), 4);
         assert_eq!(mesh.faces, [[0, 1, 2], [1, 2, 3]]);
+    }
+
+    #[test]
+    fn labels_that_nobody_gave_stand_for_true_labels_that_nobody_gave() {
+        let mesh = strip(&[1.0, 1.0, 1.0, 1.0]);
+        let of = |truth: &[i32], predicted: &[i32], given: &[i32]| {
+            let shape = ScoredShape {
+                mesh: &mesh,
+                truth,
+                predicted: Some(predicted),
+            };
+            accuracy_open(&[shape], &given.iter().copied().collect()).unwrap()
+        };
+        let truth = [0, 1, 2, 2];
+        assert!((of(&truth, &[0, 1, 9, 9], &[0, 1]) - 1.0).abs() < TOLERANCE);
+        // 9 cannot stand for a label that a person gave, and one label stands for one.
+        assert!((of(&truth, &[9, 1, 9, 9], &[0, 1]) - 0.75).abs() < TOLERANCE);
+        assert!((of(&truth, &[0, 1, 9, 8], &[0, 1]) - 0.75).abs() < TOLERANCE);
+        // A given label is right by its id alone; the ids of others do not matter.
+        assert!((of(&truth, &[1, 0, 2, 2], &[0, 1]) - 0.5).abs() < TOLERANCE);
+        assert!((of(&truth, &[2, 1, 0, 0], &[1]) - 1.0).abs() < TOLERANCE);
     }
 
     #[test]

@@ -16,6 +16,7 @@ use super::types::{
 };
 use crate::pipeline::Params;
 use crate::store::{CollectionId, CollectionRow, LabelRow, NewCollection, Reader, Tx};
+use std::collections::BTreeMap;
 
 const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
@@ -174,10 +175,11 @@ pub(super) fn label_in(
     collection: CollectionId,
     label: LabelId,
 ) -> Result<LabelInfo> {
-    let uses = reader.label_uses(collection)?;
-    let n_shapes = uses.get(&label).copied().unwrap_or(0);
     let labels = reader.labels(collection)?;
-    Ok(label_info(find_label(&labels, label)?.clone(), n_shapes))
+    let row = reader.collection_by_id(collection)?;
+    let row = row.ok_or_else(|| damaged("collections", &format!("{collection} is gone")))?;
+    let uses = LabelUses::new(reader, &row, &State::of(&row)?)?;
+    Ok(uses.info(find_label(&labels, label)?.clone()))
 }
 
 /// Finds a label among those of a collection, in use or not.
@@ -186,22 +188,45 @@ pub(super) fn find_label(labels: &[LabelRow], label: LabelId) -> Result<&LabelRo
     found.ok_or_else(|| LibraryError::not_found(Named::Label, label.to_string()))
 }
 
-/// A label with the number of shapes that have it.
-fn label_info(row: LabelRow, n_shapes: u64) -> LabelInfo {
-    LabelInfo {
-        id: row.id,
-        name: row.name,
-        colour: row.colour,
-        merged_into: row.merged_into,
-        n_shapes,
+/// How much a collection's labels are used, and by whom.
+struct LabelUses {
+    /// Number of shapes with each label, and the sum of their area shares.
+    uses: BTreeMap<LabelId, (u64, f64)>,
+    n_shapes: u64,
+    kept: Vec<LabelId>,
+}
+
+impl LabelUses {
+    fn new(reader: &Reader<'_>, row: &CollectionRow, state: &State) -> Result<Self> {
+        let supervision = state.regime.supervision();
+        Ok(Self {
+            uses: reader.label_uses(row.id)?,
+            n_shapes: reader.n_shapes(row.id)?,
+            kept: supervision.map_or_else(Vec::new, |s| s.discovered().kept.clone()),
+        })
+    }
+
+    fn info(&self, row: LabelRow) -> LabelInfo {
+        let (n_shapes, area) = self.uses.get(&row.id).copied().unwrap_or_default();
+        LabelInfo {
+            unclaimed: row.name.is_none()
+                && row.merged_into.is_none()
+                && self.kept.contains(&row.id),
+            id: row.id,
+            name: row.name,
+            colour: row.colour,
+            merged_into: row.merged_into,
+            n_shapes,
+            area_share: area / self.n_shapes.max(1) as f64,
+        }
     }
 }
 
 fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
     let location = format!("collections {}", row.name);
-    let uses = reader.label_uses(row.id)?;
     let labels = reader.labels(row.id)?.into_iter();
     let state = State::of(&row)?;
+    let uses = LabelUses::new(reader, &row, &state)?;
     Ok(CollectionInfo {
         up_estimate: state.up.map(|up| UpEstimate {
             up: Up::along(up.vote().trusted()),
@@ -216,14 +241,9 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
         }),
         n_undoable: reader.n_corrections(row.id)?,
         sequence: row.sequence,
-        n_shapes: reader.n_shapes(row.id)?,
+        n_shapes: uses.n_shapes,
         n_stale: reader.n_stale(row.id)?,
-        labels: labels
-            .map(|l| {
-                let n_shapes = uses.get(&l.id).copied().unwrap_or(0);
-                label_info(l, n_shapes)
-            })
-            .collect(),
+        labels: labels.map(|l| uses.info(l)).collect(),
         spec: CollectionSpec {
             n_parts: row.n_parts,
             up: row.up.parse::<Up>().map_err(|e| damaged(&location, &e))?,

@@ -2,7 +2,7 @@
 //! from them.
 
 use super::change::{Change, LabelEdit, Undoable, commit_once};
-use super::collection::state::{Supervision, Vocabulary};
+use super::collection::state::Vocabulary;
 use super::collection::{Collection, Staleness, supervised};
 use super::error::{LibraryError, Result};
 use super::event::EventKind;
@@ -49,6 +49,16 @@ pub enum Correction {
     },
 }
 
+/// What else a person says with a correction.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct CorrectionOptions<'a> {
+    /// The person, recorded in the shape's review; may be empty.
+    pub by: &'a str,
+    /// True: there are no labels but those that persons used. False: discovered labels that no
+    /// labelled shape shows are labels too. `None`: as before; false in the beginning.
+    pub closed: Option<bool>,
+}
+
 /// What a correction did.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Corrected {
@@ -73,7 +83,7 @@ impl Correction {
     /// Returns a digest that distinguishes this correction from every other one of the same shape.
     /// The layout is versioned: a different layout would refuse an honest repeat of a request that
     /// was answered before.
-    fn digest(&self, collection: &str, shape: &str) -> Digest {
+    fn digest(&self, collection: &str, shape: &str, closed: Option<bool>) -> Digest {
         let mut fields = blake3::Hasher::new();
         let mut field = |bytes: &[u8]| {
             fields.update(&(bytes.len() as u64).to_le_bytes());
@@ -97,6 +107,9 @@ impl Correction {
                 field(&part.to_le_bytes());
                 field(&label.to_le_bytes());
             }
+        }
+        if let Some(closed) = closed {
+            field(if closed { b"closed" } else { b"open" });
         }
         Digest(*fields.finalize().as_bytes())
     }
@@ -136,25 +149,27 @@ impl Library {
         correction: &Correction,
         key: Option<&RequestKey>,
     ) -> Result<Corrected> {
-        self.correct_by(collection, shape, correction, "", key)
+        let options = CorrectionOptions::default();
+        self.correct_with(collection, shape, correction, &options, key)
     }
 
-    /// Does what [`Library::correct`] does, and records the person `by` in the shape's review.
+    /// Does what [`Library::correct`] does, and what else `options` say.
     ///
     /// # Errors
     /// Those of [`Library::correct`]; or the name of the person is not valid.
-    pub fn correct_by(
+    pub fn correct_with(
         &self,
         collection: &str,
         shape: &str,
         correction: &Correction,
-        by: &str,
+        options: &CorrectionOptions<'_>,
         key: Option<&RequestKey>,
     ) -> Result<Corrected> {
-        check_reviewer(by)?;
+        check_reviewer(options.by)?;
+        let digest = correction.digest(collection, shape, options.closed);
         let request = Request {
             earlier: Some(correction.digest_of_first_release(collection, shape)),
-            ..Request::new(key, correction.digest(collection, shape))
+            ..Request::new(key, digest)
         };
         let row = self.collection_row(collection)?;
         self.with_collection(row, |in_memory| {
@@ -162,8 +177,8 @@ impl Library {
                 return from_reply(&reply);
             }
             let id = self.shape_row(collection, shape)?.1.id;
-            let mut corrects = corrects(in_memory, &self.store, id, correction)?;
-            let review = review_row(ReviewState::Corrected, by);
+            let mut corrects = corrects(in_memory, &self.store, id, correction, options.closed)?;
+            let review = review_row(ReviewState::Corrected, options.by);
             corrects.change.reviews.push((id, Some(review)));
             let reply = corrects.commit(&self.store, in_memory, &request, |done| to_json(&done))?;
             from_reply(&reply)
@@ -202,12 +217,14 @@ impl Corrects {
     }
 }
 
-/// Returns the change that corrects one shape.
+/// Returns the change that corrects one shape. `closed`: whether there are no labels but those that
+/// persons used; `None`: as before.
 pub(super) fn corrects(
     collection: &Collection,
     sources: &dyn Sources,
     id: ShapeId,
     correction: &Correction,
+    closed: Option<bool>,
 ) -> Result<Corrects> {
     let known = sources.known(id)?;
     let view = known.view();
@@ -220,7 +237,12 @@ pub(super) fn corrects(
         }
     }
     let before = used_labels(collection, sources, None)?;
-    let after = used_labels(collection, sources, Some(Instead::Pinned(&known, &pins)))?;
+    let mut after = used_labels(collection, sources, Some(Instead::Pinned(&known, &pins)))?;
+    match closed {
+        Some(true) => after.vocabulary = Vocabulary::Closed,
+        Some(false) => after.vocabulary = after.shown,
+        None => {}
+    }
     if after.labels.len() > MAX_LABELS {
         let message = format!(
             "collection {:?} would have {} labels, the limit is {MAX_LABELS}",
@@ -231,11 +253,7 @@ pub(super) fn corrects(
     }
     let in_use = active_labels(collection, &before);
     let new = after.labels.iter().filter(|l| !in_use.contains(l));
-    let mut labels: Vec<LabelEdit> = new.map(|label| LabelEdit::Used(*label)).collect();
-    if after.vocabulary == Vocabulary::Closed {
-        let retired = in_use.iter().filter(|l| !after.labels.contains(l));
-        labels.extend(retired.map(|label| LabelEdit::Retired(*label)));
-    }
+    let labels = new.map(|label| LabelEdit::Used(*label)).collect();
     let new = corrected_labels(&known, &view, &pins);
     let relabelled = Relabelled::new(&known, new, cause::CORRECTION);
     let version = relabelled.labels.row.version;
@@ -279,10 +297,7 @@ pub(super) fn corrects(
 /// Returns the labels that shapes of a collection may have before a change.
 fn active_labels(collection: &Collection, used: &UsedLabels) -> BTreeSet<LabelId> {
     let mut labels = used.labels.clone();
-    let supervision = collection.state().regime.supervision();
-    if !supervision.is_some_and(Supervision::is_closed) {
-        labels.extend(collection.label_model().iter().flat_map(|m| &m.labels));
-    }
+    labels.extend(collection.label_model().iter().flat_map(|m| &m.labels));
     labels
 }
 
@@ -454,9 +469,11 @@ mod tests {
             ("a", "b", part(1, 2)),
             ("a", "b", part(2, 1)),
         ];
-        let digest = |c: &(&str, &str, Correction)| c.2.digest(c.0, c.1).0;
+        let digest = |c: &(&str, &str, Correction)| c.2.digest(c.0, c.1, None).0;
         let distinct: std::collections::BTreeSet<[u8; 32]> = all.iter().map(digest).collect();
         assert_eq!(distinct.len(), all.len());
         assert_eq!(digest(&all[0]), digest(&all[0].clone()));
+        let said = |closed| all[0].2.digest("a", "b", closed).0;
+        assert!(said(None) != said(Some(true)) && said(Some(true)) != said(Some(false)));
     }
 }

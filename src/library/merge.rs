@@ -1,7 +1,7 @@
 //! Merges two labels into one, and splits one label into two.
 
 use super::change::{Change, Undoable, commit_once};
-use super::collection::state::{Discovered, Supervision};
+use super::collection::state::Discovered;
 use super::collection::{Collection, Staleness, fit, supervised};
 use super::collections::{find_label, label_in};
 use super::error::{LibraryError, Result};
@@ -180,10 +180,12 @@ fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Resu
     let shapes = collection.shapes();
     let new = collection.row().next_label;
     let supervision = collection.state().regime.supervision();
-    let is_closed = supervision.is_some_and(Supervision::is_closed);
+    let mut kept = supervision.map_or_else(Vec::new, |s| s.discovered().kept.clone());
+    // Training shapes show every label, unless discovered ones may be on other shapes alone.
+    let on_training = supervision.is_some_and(|s| !s.is_open()) && kept.is_empty();
     let members = fit::members(collection);
     let chosen: Vec<usize> = (0..shapes.len())
-        .filter(|at| shapes[*at].pinned || !is_closed && members.contains(at))
+        .filter(|at| shapes[*at].pinned || !on_training && members.contains(at))
         .collect();
     let known = chosen.iter().map(|at| sources.known(shapes[*at].id));
     let known: Vec<Known> = known.collect::<Result<_>>()?;
@@ -199,9 +201,13 @@ fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Resu
         return Err(too_few(label));
     };
     let n_old = model.labels.len();
+    if kept.contains(&label) {
+        kept.push(new);
+    }
     let mut discovered = Discovered {
         labels: model.labels.iter().copied().chain([new]).collect(),
         versions: Vec::new(),
+        kept,
     };
     let (mut relabelled, mut pins) = (Vec::new(), Vec::new());
     for (i, known) in known.iter().enumerate() {

@@ -77,7 +77,7 @@ pub use agreement::Disagreement;
 pub use choose::Chosen;
 pub use collection::discovered::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use collections::MAX_PARTS;
-pub use correct::{Corrected, Correction, MAX_LABEL, MAX_LABELS};
+pub use correct::{Corrected, Correction, CorrectionOptions, MAX_LABEL, MAX_LABELS};
 pub use error::{LibraryError, Named};
 pub use event::{Event, EventKind, LabelMove};
 pub use facade::Library;

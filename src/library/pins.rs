@@ -2,7 +2,7 @@
 //! use.
 
 use super::collection::Collection;
-use super::collection::state::Vocabulary;
+use super::collection::state::{Supervision, Vocabulary};
 use super::error::Result;
 use super::rows::damaged;
 use super::sources::{Known, Sources};
@@ -12,14 +12,16 @@ use crate::segmentation::Surface;
 use crate::store::{LabelVersionRow, ShapeId};
 use std::collections::{BTreeSet, VecDeque};
 
-/// Share of a shape's area that a person must have labelled for the shape to define the vocabulary.
+/// Share of a shape's area that a person must have labelled for the shape to show its labels.
 const WHOLE: f64 = 0.9;
 
-/// The labels that persons used, and whether they are the whole vocabulary.
+/// The labels that persons used, and which others shapes can have.
 #[derive(Debug)]
 pub(super) struct UsedLabels {
     pub(super) labels: BTreeSet<LabelId>,
     pub(super) vocabulary: Vocabulary,
+    /// The vocabulary if no person had said that there are no others.
+    pub(super) shown: Vocabulary,
 }
 
 /// A stored shape whose pins are about to change.
@@ -43,11 +45,11 @@ pub(super) fn used_labels(
         None => None,
     };
     let mut labels = BTreeSet::new();
-    let mut vocabulary = Vocabulary::Open;
+    let mut shown = Vocabulary::Open;
     let mut take = |view: &DescriptionView<'_>, pins: &[i32]| {
         labels.extend(pins.iter().filter_map(|p| u32::try_from(*p).ok()));
         if pinned_share(view, pins) >= WHOLE {
-            vocabulary = Vocabulary::Closed;
+            shown = Vocabulary::Covered;
         }
     };
     let pinned = collection.shapes().iter().filter(|s| s.pinned);
@@ -60,7 +62,16 @@ pub(super) fn used_labels(
     if let Some(Instead::Pinned(known, pins)) = instead {
         take(&known.view(), pins);
     }
-    Ok(UsedLabels { labels, vocabulary })
+    let supervision = collection.state().regime.supervision();
+    let vocabulary = match supervision.map(Supervision::vocabulary) {
+        Some(Vocabulary::Closed) => Vocabulary::Closed,
+        _ => shown,
+    };
+    Ok(UsedLabels {
+        labels,
+        vocabulary,
+        shown,
+    })
 }
 
 /// Returns the pins of a shape that a person labelled.

@@ -241,7 +241,7 @@ impl Library {
                 faces: faces_of(&known.view(), &parts, part),
                 label,
             };
-            let mut corrects = corrects(in_memory, &self.store, id, &correction)?;
+            let mut corrects = corrects(in_memory, &self.store, id, &correction, None)?;
             let change = &mut corrects.change;
             change.undoable = Some(Undoable::Answer {
                 shape: shape.to_owned(),

@@ -7,7 +7,7 @@ use super::facade::Library;
 use super::once::{Request, answered};
 use super::pins::{Instead, used_labels};
 use super::sources::Sources;
-use super::types::RequestKey;
+use super::types::{LabelId, RequestKey};
 use crate::store::ShapeRow;
 
 impl Library {
@@ -54,13 +54,14 @@ fn removal(collection: &Collection, sources: &dyn Sources, gone: &ShapeRow) -> R
     }
     let refit = supervised::refit(collection, sources, Some(gone.id))?;
     if let Some(supervision) = refit {
-        if supervision.is_closed() {
-            let before = used_labels(collection, sources, None)?.labels;
-            let removed = Some(Instead::Removed(gone.id));
-            let after = used_labels(collection, sources, removed)?.labels;
-            let retired = before.difference(&after);
-            change.labels = retired.map(|label| LabelEdit::Retired(*label)).collect();
-        }
+        // The next fit retires labels of the model. Those that it never had are gone now.
+        let before = used_labels(collection, sources, None)?.labels;
+        let removed = Some(Instead::Removed(gone.id));
+        let after = used_labels(collection, sources, removed)?.labels;
+        let model = collection.label_model();
+        let is_new = |label: &&LabelId| model.is_none_or(|m| !m.labels.contains(label));
+        let retired = before.difference(&after).filter(is_new);
+        change.labels = retired.map(|label| LabelEdit::Retired(*label)).collect();
         change.state = Some(supervised::with(collection, supervision));
         change.staleness = Staleness::All;
     }

@@ -33,7 +33,8 @@ impl Library {
             }
             let id = self.shape_row(collection, shape)?.1.id;
             let labels = self.store.known(id)?.labels.polygon_labels;
-            let mut corrects = corrects(in_memory, &self.store, id, &Correction::Whole(labels))?;
+            let mut corrects =
+                corrects(in_memory, &self.store, id, &Correction::Whole(labels), None)?;
             corrects.change.undoable = Some(Undoable::Approve {
                 shape: shape.to_owned(),
             });

@@ -138,6 +138,14 @@ pub struct LabelInfo {
     pub merged_into: Option<LabelId>,
     /// Number of shapes that have it.
     pub n_shapes: u64,
+    /// Mean over all shapes of the share of their area that has it, 0 to 1. 0 in a reply that an
+    /// earlier version stored.
+    #[serde(default)]
+    pub area_share: f64,
+    /// Whether it is a discovered label that stays beside those of persons, because no labelled
+    /// shape shows it and nobody has named it.
+    #[serde(default)]
+    pub unclaimed: bool,
 }
 
 /// A shape to be added.

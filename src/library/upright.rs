@@ -107,11 +107,11 @@ fn without_clustering(
         false => supervised::refit(collection, sources, None)?,
     };
     if let Some(supervision) = refit {
-        // Where the vocabulary is closed, labels that were discovered along the old axis count no
-        // longer.
-        state.regime = Regime::Supervised(match supervision.is_closed() {
-            true => supervision.without_discovered(),
-            false => supervision,
+        // Where a person labelled whole shapes, labels that were discovered along the old axis
+        // count no longer.
+        state.regime = Regime::Supervised(match supervision.is_open() {
+            true => supervision,
+            false => supervision.without_discovered(),
         });
         staleness = Staleness::All;
     }

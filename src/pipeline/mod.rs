@@ -61,6 +61,7 @@ pub use recluster::{
 };
 pub use split::{split_faces, split_model};
 pub use supervised::{
-    FitMap, FitOptions, FitShape, Fitted, FurtherEvidence, fit, label_fitted, proxy_pins,
+    DiscoveredLabels, FitMap, FitOptions, FitShape, Fitted, FurtherEvidence, fit, label_fitted,
+    proxy_pins,
 };
 pub use yang_tian::yang_tian_baseline;

@@ -28,7 +28,7 @@ use super::place::{blended, vote_probabilities};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
 use crate::labels::cut::{STRENGTH, cut};
-use crate::labels::{Classifier, Pinned, PriorLabels, Statistics};
+use crate::labels::{Classifier, Overlap, PriorLabels, Statistics};
 use crate::segmentation::{Surface, parts};
 use rayon::iter::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
@@ -129,15 +129,26 @@ pub struct FurtherEvidence<'a> {
     /// Number of training shapes, including those of the fit. Each counts by the share of its area
     /// that is pinned.
     pub n_training: f64,
-    /// Statistics, over many shapes, of labels that were discovered before a person labelled
-    /// anything, where shapes cannot have these labels any more. They show what parts are like on
-    /// average and how much parts of one label differ between shapes, which a few training shapes
-    /// do not show.
-    pub discovered: Option<&'a Statistics>,
+    /// Labels that were discovered before a person labelled anything, where a person has labelled
+    /// whole shapes since. They show what parts are like on average and how much parts of one label
+    /// differ between shapes, which a few training shapes do not show.
+    pub discovered: Option<&'a DiscoveredLabels>,
 }
 
-/// Fits a model of `k` classes to some shapes and labels them. Costs a cut for each shape and
-/// round.
+/// Discovered labels beside a person's.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DiscoveredLabels {
+    /// Statistics of the labels over many shapes.
+    pub statistics: Statistics,
+    /// Faces of the training shapes that have a discovered label and a class of the person.
+    pub overlap: Overlap,
+    /// Labels that no labelled face shows, each with the class that stands for it: a class of its
+    /// own behind those of the person, or the class into which a person merged it.
+    pub own: Vec<(usize, u32)>,
+}
+
+/// Fits a model of `k` classes, kept discovered labels included, to some shapes and labels them.
+/// Costs a cut for each shape and round.
 pub fn fit(
     members: &[FitShape<'_>],
     maps: &[FitMap<'_>],
@@ -147,7 +158,7 @@ pub fn fit(
 ) -> Fitted {
     let worth = options.discovered_worth;
     let share = worth / (worth + further.n_training);
-    let scatter = further.discovered.map(Statistics::scatter_within);
+    let scatter = further.discovered.map(|d| d.statistics.scatter_within());
     let with_scatter = |statistics: &Statistics| match &scatter {
         Some(scatter) => statistics.with_scatter(scatter, share),
         None => statistics.clone(),
@@ -163,15 +174,9 @@ pub fn fit(
         );
         certain.accumulate(&of_shape, options.pinned_weight);
     }
-    let prior = further.discovered.map(|discovered| {
-        let pinned = members.iter().filter(|l| !l.pinned.is_empty());
-        let pinned = pinned.map(|l| Pinned {
-            surface: &l.prepared.surface,
-            features: &l.prepared.features,
-            classes: l.pinned,
-        });
-        PriorLabels::new(discovered.clone(), pinned, k)
-    });
+    let prior = further
+        .discovered
+        .map(|d| PriorLabels::new(d.statistics.clone(), &d.overlap, &d.own, k));
     if let Some(prior) = &prior {
         let translated = prior.translated();
         let each = certain.total() / further.n_training.max(1e-3);

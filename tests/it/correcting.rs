@@ -2,7 +2,9 @@
 
 use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
 use coseg::Library;
-use coseg::library::{Correction, EventKind, LibraryError, MAX_MAPS, Reason, RequestKey, Up};
+use coseg::library::{
+    Correction, CorrectionOptions, EventKind, LibraryError, MAX_MAPS, Reason, RequestKey, Up,
+};
 use coseg::mesh::icosphere;
 use coseg::synth::{Family, Labelled, family};
 use std::collections::{BTreeMap, BTreeSet};
@@ -76,13 +78,13 @@ fn one_corrected_shape_labels_all_others_by_its_ids() {
     let carried = kinds
         .iter()
         .filter(|k| matches!(k, EventKind::LabelsChanged { cause, .. } if cause == "carrying"));
-    assert!(created < corrected && retired < corrected);
+    assert!(created < corrected && corrected < retired);
     assert_eq!(carried.count(), 6);
-    assert!(
-        kinds[corrected + 1..]
-            .iter()
-            .all(|k| matches!(k, EventKind::LabelsChanged { .. }))
-    );
+    let after = kinds[corrected + 1..].iter();
+    assert!(after.clone().all(|k| matches!(
+        k,
+        EventKind::LabelsChanged { .. } | EventKind::LabelRetired { .. }
+    )));
 
     // Shapes that are added later have the same ids, also after the library was closed.
     let before = all_labels(&library);
@@ -92,6 +94,131 @@ fn one_corrected_shape_labels_all_others_by_its_ids() {
     stream(&library, &shapes[7..]);
     let score = right(&library, &shapes, &[&chosen.name]);
     assert!(score > 0.85, "{score:.3} of the faces are right by id");
+}
+
+/// Share of the area of some shapes whose label no labelled shape shows.
+fn unclaimed(library: &Library, shapes: &[Labelled]) -> f64 {
+    let labels = library.collection(COLLECTION).unwrap().labels;
+    let unclaimed: BTreeSet<u32> = labels
+        .iter()
+        .filter(|l| l.unclaimed)
+        .map(|l| l.id)
+        .collect();
+    let found = all_labels(library);
+    let share = |s: &Labelled| {
+        let labels = &found[&s.name];
+        let hits = labels.iter().filter(|l| unclaimed.contains(&(**l as u32)));
+        hits.count() as f64 / labels.len() as f64
+    };
+    shapes.iter().map(share).sum::<f64>() / shapes.len() as f64
+}
+
+#[test]
+fn labels_that_no_labelled_shape_shows_stay_until_a_person_says_otherwise() {
+    let pliers = family(Family::Pliers, 31, 5, &SMALL);
+    let guitars = family(Family::Guitar, 32, 5, &SMALL);
+    let (folder, library) = library(6, Up::Unknown);
+    stream(&library, &pliers);
+    stream(&library, &guitars);
+    let since = sequence(&library);
+    correct(&library, &pliers[0]);
+    propagate(&library);
+    // Pliers have the person's labels; guitars have labels that were discovered.
+    let by_id = right(&library, &pliers, &[&pliers[0].name]);
+    assert!(by_id > 0.6, "{by_id:.3} of the other pliers");
+    let (of_pliers, of_guitars) = (unclaimed(&library, &pliers), unclaimed(&library, &guitars));
+    assert!(
+        of_pliers < 0.1 && of_guitars > 0.5,
+        "{of_pliers:.3} {of_guitars:.3}"
+    );
+    let info = library.collection(COLLECTION).unwrap();
+    let area: f64 = info.labels.iter().map(|l| l.area_share).sum();
+    assert!((area - 1.0).abs() < 1e-6, "{area}");
+    let kept: Vec<u32> = info
+        .labels
+        .iter()
+        .filter(|l| l.unclaimed)
+        .map(|l| l.id)
+        .collect();
+    let retired = kinds(&library, since).into_iter().filter_map(|k| match k {
+        EventKind::LabelRetired { label } => Some(label),
+        _ => None,
+    });
+    let retired: BTreeSet<u32> = retired.collect();
+    assert!(!retired.is_empty() && kept.iter().all(|l| !retired.contains(l)));
+    // The next shape to label is one that shows them.
+    let next = library.suggest(COLLECTION).unwrap().shape;
+    assert!(guitars.iter().any(|g| g.name == next), "{next}");
+
+    // They are the same after a restart, and an undone correction brings back the first labels.
+    let labels = all_labels(&library);
+    drop(library);
+    let library = Library::open(folder.path()).unwrap();
+    assert_eq!(all_labels(&library), labels);
+    assert!(unclaimed(&library, &guitars) > 0.5);
+
+    // A person says that there are no other labels, and takes that back.
+    let say = |closed| {
+        let options = CorrectionOptions {
+            by: "",
+            closed: Some(closed),
+        };
+        let same = Correction::Whole(truth(&pliers[0]));
+        let done = library.correct_with(COLLECTION, &pliers[0].name, &same, &options, None);
+        done.unwrap();
+        propagate(&library);
+    };
+    say(true);
+    let used: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert_eq!(used, (10..13).collect());
+    say(false);
+    assert_eq!(all_labels(&library), labels, "as before");
+
+    // What a person merges into a label means that label from then on.
+    library.merge_labels(COLLECTION, kept[0], 10, None).unwrap();
+    let merged = unclaimed(&library, &guitars);
+    correct(&library, &pliers[1]);
+    propagate(&library);
+    let later = unclaimed(&library, &guitars);
+    assert!((later - merged).abs() < 0.1, "{merged:.3} {later:.3}");
+
+    // A guitar that a person labelled shows all of them.
+    let ids: Vec<i32> = guitars[0].labels.iter().map(|l| *l as i32 + 20).collect();
+    let correction = Correction::Whole(ids);
+    library
+        .correct(COLLECTION, &guitars[0].name, &correction, None)
+        .unwrap();
+    propagate(&library);
+    assert_eq!(unclaimed(&library, &guitars), 0.0);
+    assert_eq!(unclaimed(&library, &pliers), 0.0);
+}
+
+/// A person's labels have ids of their own choice, and may have those of discovered labels.
+#[test]
+fn a_label_whose_id_a_person_gives_to_other_faces_gets_a_new_one() {
+    let pliers = family(Family::Pliers, 33, 4, &SMALL);
+    let guitars = family(Family::Guitar, 34, 4, &SMALL);
+    let (_folder, library) = library(6, Up::Unknown);
+    stream(&library, &pliers);
+    stream(&library, &guitars);
+    let ids: Vec<i32> = pliers[0].labels.iter().map(|l| *l as i32 * 2).collect();
+    let given: BTreeSet<i32> = ids.iter().copied().collect();
+    library
+        .correct(COLLECTION, &pliers[0].name, &Correction::Whole(ids), None)
+        .unwrap();
+    propagate(&library);
+    let labels = library.collection(COLLECTION).unwrap().labels;
+    let kept: Vec<i32> = labels
+        .iter()
+        .filter(|l| l.unclaimed)
+        .map(|l| l.id as i32)
+        .collect();
+    assert!(
+        !kept.is_empty() && kept.iter().all(|l| !given.contains(l)),
+        "{kept:?}"
+    );
+    let share = unclaimed(&library, &guitars);
+    assert!(share > 0.5, "{share:.3}");
 }
 
 #[test]

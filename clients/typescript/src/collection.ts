@@ -408,7 +408,9 @@ export class Collection {
   /**
    * Labels faces of a shape by hand: an integer for each face (−1 leaves it unchanged), one label
    * for some faces, or one for a part. Only a person changes these labels again; other shapes
-   * follow: {@link waitIdle}.
+   * follow: {@link waitIdle}. With `closed` there are no labels but those that persons used; if it
+   * is false, discovered labels that no labelled shape shows are labels too; without it that stays
+   * as it is.
    */
   async correct(
     name: string,
@@ -416,6 +418,7 @@ export class Collection {
       | Int32Array
       | { readonly faces: Uint32Array; readonly label: number | string }
       | { readonly part: number; readonly label: number | string },
+    options: { readonly closed?: boolean } = {},
   ): Promise<Corrected> {
     const writer = new FrameWriter();
     const what =
@@ -427,7 +430,7 @@ export class Collection {
               value: { faces: writer.array(correction.faces, correction.faces.length), label: await this.#label(correction.label) },
             }
           : { case: "part" as const, value: { part: correction.part, label: await this.#label(correction.label) } };
-    const request = { collection: this.name, shape: name, correction: what };
+    const request = { collection: this.name, shape: name, correction: what, ...options };
     const [reply] = await this.library.call("correctLabels", request, { frames: writer.frames });
     return { ...plain(reply), jobId: reply.jobId };
   }

@@ -4,7 +4,7 @@ use crate::error::{BenchError, Outcome};
 use crate::print::{print_line, table};
 use crate::proposals::ProposalScores;
 use crate::session::{Session, log_warnings};
-use crate::stream::{Category, Run};
+use crate::stream::{Category, Run, WithExemplars};
 use crate::{Global, proposals, stream};
 use clap::Args;
 use coseg::ipc::convert::parse_up;
@@ -43,7 +43,8 @@ pub(crate) struct BenchLabels {
     estimate: bool,
     /// After the stream, give the shapes that the daemon suggests their true labels, and score the
     /// others by label id after each of these numbers of labelled shapes, such as 0,1,3,5 (0: the
-    /// stream itself, which is always scored)
+    /// stream itself, which is always scored). In parentheses: where labels that no person gave
+    /// stand, one to one, for true labels that no person gave
     #[arg(
         long,
         value_name = "N,...",
@@ -70,6 +71,10 @@ pub(crate) struct BenchLabels {
 /// Number of shapes at the beginning and at the end of a stream whose times are compared.
 const N_TIMED: usize = 50;
 
+/// The two ways to compare labels with a person's.
+const STRICT: fn(&WithExemplars) -> f64 = |w| w.strict;
+const OPEN: fn(&WithExemplars) -> f64 = |w| w.open;
+
 /// Accuracies of one category.
 struct Row {
     name: String,
@@ -85,10 +90,10 @@ impl Row {
     }
 
     /// Accuracy with labelled shapes, for each number of them, over the orders.
-    fn with_exemplars(&self) -> Vec<f64> {
+    fn with_exemplars(&self, which: fn(&WithExemplars) -> f64) -> Vec<f64> {
         let n = self.runs.first().map_or(0, |r| r.with_exemplars.len());
         (0..n)
-            .map(|i| mean(self.runs.iter().map(|r| r.with_exemplars[i])))
+            .map(|i| mean(self.runs.iter().map(|r| which(&r.with_exemplars[i]))))
             .collect()
     }
 
@@ -110,7 +115,7 @@ impl Row {
     fn spread_with_exemplars(&self) -> Vec<f64> {
         let n = self.runs.first().map_or(0, |r| r.with_exemplars.len());
         (0..n)
-            .map(|i| spread(self.runs.iter().map(|r| r.with_exemplars[i])))
+            .map(|i| spread(self.runs.iter().map(|r| r.with_exemplars[i].strict)))
             .collect()
     }
 
@@ -250,7 +255,7 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
     let others = rows.first().map_or(&[][..], |r| &r.others);
     let has_proposals = rows.iter().all(|r| r.best_of_proposals().is_some());
     head.extend(has_proposals.then(|| "best proposal".to_owned()));
-    head.extend(exemplars.iter().map(|n| format!("{n} labelled")));
+    head.extend(exemplars.iter().map(|n| format!("{n} labelled (open)")));
     head.extend(others.iter().map(|o| o.0.to_owned()));
     let mut lines = vec![head];
     for r in rows {
@@ -268,7 +273,9 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
             format!("{:.3}", r.spread()),
         ];
         line.extend(r.best_of_proposals().map(|a| format!("{a:.3}")));
-        line.extend(r.with_exemplars().iter().map(|a| format!("{a:.3}")));
+        let open = r.with_exemplars(OPEN).into_iter();
+        let both = r.with_exemplars(STRICT).into_iter().zip(open);
+        line.extend(both.map(|(strict, open)| format!("{strict:.3} ({open:.3})")));
         line.extend(r.others.iter().map(|o| format!("{:.3}", o.1)));
         lines.push(line);
     }
@@ -282,8 +289,9 @@ fn lines(rows: &[Row], exemplars: &BTreeSet<usize>) -> Vec<Vec<String>> {
     last.extend([format!("{streamed:.3}"), format!("{spread:.3}")]);
     let best: Option<Vec<f64>> = rows.iter().map(Row::best_of_proposals).collect();
     last.extend(best.map(|b| format!("{:.3}", mean(b.into_iter()))));
-    let labelled = |i| mean(rows.iter().map(|r| r.with_exemplars()[i]));
-    last.extend((0..exemplars.len()).map(|i| format!("{:.3}", labelled(i))));
+    let labelled = |which, i| mean(rows.iter().map(|r| r.with_exemplars(which)[i]));
+    let both = (0..exemplars.len()).map(|i| (labelled(STRICT, i), labelled(OPEN, i)));
+    last.extend(both.map(|(strict, open)| format!("{strict:.3} ({open:.3})")));
     last.extend(
         (0..others.len()).map(|i| format!("{:.3}", mean(rows.iter().map(|r| r.others[i].1)))),
     );
@@ -305,7 +313,8 @@ fn report(rows: &[Row]) -> Value {
                     "n_missing": run.n_missing,
                     "seconds": run.seconds,
                     "place_ms": run.place_ms,
-                    "with_exemplars": run.with_exemplars,
+                    "with_exemplars": run.with_exemplars.iter().map(STRICT).collect::<Vec<_>>(),
+                    "with_exemplars_open": run.with_exemplars.iter().map(OPEN).collect::<Vec<_>>(),
                     "proposals": run.proposals.as_ref().map(ProposalScores::report),
                 })
             })
@@ -325,7 +334,8 @@ fn report(rows: &[Row]) -> Value {
             "place_ms": r.place_ms(),
             "place_growth": r.place_growth(),
             "best_of_proposals": r.best_of_proposals(),
-            "with_exemplars": r.with_exemplars(),
+            "with_exemplars": r.with_exemplars(STRICT),
+            "with_exemplars_open": r.with_exemplars(OPEN),
             "spread_with_exemplars": r.spread_with_exemplars(),
             "orders": runs,
             "others": others,

@@ -12,7 +12,7 @@ use coseg::ipc::frames::FrameWriter;
 use coseg::ipc::wire::{
     self, correct_labels_request::Correction, reply, request, shape_input::Source,
 };
-use coseg::labels::score::{Score, ScoredShape, accuracy_by_id, score};
+use coseg::labels::score::{Score, ScoreError, ScoredShape, accuracy_by_id, accuracy_open, score};
 use coseg::labels::{Baseline, DiscoveryOptions};
 use coseg::library::Library;
 use coseg::mesh::{self, Format, TriMesh};
@@ -62,10 +62,19 @@ pub(crate) struct Run {
     /// description.
     pub(crate) place_ms: Vec<f64>,
     /// Accuracy of the other shapes, for each requested number of shapes labelled by hand.
-    pub(crate) with_exemplars: Vec<f64>,
+    pub(crate) with_exemplars: Vec<WithExemplars>,
     /// The proposals, if they are asked for.
     pub(crate) proposals: Option<ProposalScores>,
     labels: Vec<Option<Vec<i32>>>,
+}
+
+/// Accuracy of shapes that nobody labelled, where others are labelled by hand.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct WithExemplars {
+    /// Labels are compared by id; one that no person gave is wrong.
+    pub(crate) strict: f64,
+    /// Labels that no person gave stand for true labels that no person gave, one to one.
+    pub(crate) open: f64,
 }
 
 fn failed(path: &Path, what: impl std::fmt::Display) -> BenchError {
@@ -272,13 +281,12 @@ pub(crate) fn labels_now(
 }
 
 /// Labels the shapes that the daemon suggests, one by one, like a person, until `counts` shapes are
-/// labelled. Returns for each count (ascending) the accuracy of the other shapes, with labels
-/// compared by id.
+/// labelled. Returns for each count (ascending) the accuracy of the other shapes.
 pub(crate) fn with_exemplars(
     category: &Category,
     counts: &[usize],
     session: &mut Session,
-) -> Result<Vec<f64>, BenchError> {
+) -> Result<Vec<WithExemplars>, BenchError> {
     let mut labelled = BTreeSet::new();
     let mut accuracies = Vec::with_capacity(counts.len());
     for &count in counts {
@@ -304,12 +312,15 @@ pub(crate) fn with_exemplars(
                 shape: suggested.shape,
                 correction: Some(Correction::Labels(labels)),
                 by: String::new(),
+                closed: None,
             };
             let frames = frames.finish();
             call!(session.client, CorrectLabels(request), frames, with_frames)?;
             labelled.insert(at);
         }
         let labels = labels_now(category, session)?;
+        let given = labelled.iter().flat_map(|at| &category.shapes[*at].truth);
+        let given: BTreeSet<i32> = given.copied().collect();
         let others: Vec<ScoredShape<'_>> = category
             .shapes
             .iter()
@@ -322,11 +333,29 @@ pub(crate) fn with_exemplars(
                 predicted: labels.as_deref(),
             })
             .collect();
-        let accuracy = accuracy_by_id(&others);
-        accuracies
-            .push(accuracy.map_err(|e| BenchError::Failed(format!("{}: {e}", category.name)))?);
+        let failed = |e| BenchError::Failed(format!("{}: {e}", category.name));
+        accuracies.push(WithExemplars {
+            strict: strictly(&others, &given).map_err(failed)?,
+            open: accuracy_open(&others, &given).map_err(failed)?,
+        });
     }
     Ok(accuracies)
+}
+
+/// Accuracy by id, where a label that no person gave is wrong, whatever its id.
+fn strictly(shapes: &[ScoredShape<'_>], given: &BTreeSet<i32>) -> Result<f64, ScoreError> {
+    let of_person = |l: &i32| if given.contains(l) { *l } else { -1 };
+    let of_shape = |s: &ScoredShape<'_>| Some(s.predicted?.iter().map(of_person).collect());
+    let labels: Vec<Option<Vec<i32>>> = shapes.iter().map(of_shape).collect();
+    let shapes: Vec<ScoredShape<'_>> = shapes
+        .iter()
+        .zip(&labels)
+        .map(|(s, labels)| ScoredShape {
+            predicted: labels.as_deref(),
+            ..*s
+        })
+        .collect();
+    accuracy_by_id(&shapes)
 }
 
 /// Time of placing each shape of a finished job in milliseconds.

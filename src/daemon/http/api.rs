@@ -490,6 +490,7 @@ async fn correct(server: &Server, sent: Reserved<Correct>) -> Answer {
         shape: correction.shape,
         correction: Some(correct_labels_request::Correction::Labels(labels)),
         by: correction.by,
+        closed: None,
     };
     let (done, _) = request!(server, CorrectLabels(request), Some(frames))?;
     json_of(server, move || json::corrected(&done)).await

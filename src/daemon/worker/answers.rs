@@ -7,7 +7,7 @@ use crate::daemon::operation::{Compute, Edit};
 use crate::ipc::convert;
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::wire::{self, ErrorCode, ErrorReason, reply::Result as Reply};
-use crate::library::RequestKey;
+use crate::library::{CorrectionOptions, RequestKey};
 use crate::viewer::{Pack, PortraitError, portrait};
 use bytes::Bytes;
 
@@ -80,8 +80,12 @@ pub(super) fn edit(
         }
         Edit::CorrectLabels(r) => {
             let correction = convert::correction(&r, FrameReader::new(sent))?;
+            let options = CorrectionOptions {
+                by: &r.by,
+                closed: r.closed,
+            };
             let done = library
-                .correct_by(&r.collection, &r.shape, &correction, &r.by, key)
+                .correct_with(&r.collection, &r.shape, &correction, &options, key)
                 .map_err(refused)?;
             Reply::CorrectLabels(convert::corrected(&done))
         }

@@ -203,6 +203,8 @@ pub fn label_info(label: &LabelInfo) -> wire::LabelInfo {
         colour_rgb: r << 16 | g << 8 | b,
         merged_into: label.merged_into,
         n_shapes: label.n_shapes,
+        area_share: label.area_share,
+        unclaimed: label.unclaimed,
     }
 }
 

@@ -5,11 +5,12 @@
 //! few shapes at a time. Last, the model is fitted to all of them at once.
 
 use super::discovered::{MAX_MAPS, MAX_REPRESENTATIVES};
+use super::kept::{Kept, resolved};
 use super::state::{Phase, Supervision};
 use super::supervised::{propagated, with};
 use super::up::UpFound;
 use super::{Collection, ModelState};
-use crate::labels::{Features, LabelModel, Normalisation, Statistics};
+use crate::labels::{Features, LabelModel, Normalisation, Overlap, Pinned, Statistics};
 use crate::library::change::{Change, map_row};
 use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause};
@@ -19,10 +20,9 @@ use crate::library::sources::{Known, Sources};
 use crate::library::types::LabelId;
 use crate::library::voting::{IncomingMap, PreparedShape, new_map};
 use crate::pipeline::{
-    DescriptionView, FitMap, FitOptions, FitShape, FurtherEvidence, Prepared, fit,
+    DescriptionView, DiscoveredLabels, FitMap, FitOptions, FitShape, FurtherEvidence, Prepared, fit,
 };
 use crate::segmentation::Surface;
-use crate::store::LabelRow;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -223,18 +223,27 @@ impl Fit<'_> {
 
     /// Labels the representatives together and fits the model to them.
     fn fitted(&self, known: Vec<Known>) -> Result<Change> {
-        let mut model = LabelModel {
-            labels: self.labels()?,
-            ..self.model.clone()
-        };
-        let k = model.labels.len();
+        let given = self.labels()?;
         let maps = self.incoming_maps(&known)?;
-        let members = self.members(known, &model.labels)?;
+        let members = self.members(known, &given)?;
         let views: Vec<DescriptionView<'_>> = members.iter().map(|m| m.known.view()).collect();
         let prepared: Vec<Arc<Prepared>> = members
             .par_iter()
-            .map(|m| self.sources.prepared(m.known.file(), &model))
+            .map(|m| self.sources.prepared(m.known.file(), self.model))
             .collect();
+        let mut discovered = self.discovered_labels(&members, &prepared, given.len())?;
+        let rows = self.sources.labels(self.collection.id())?;
+        let kept = discovered.as_mut().map(|discovered| {
+            Kept::decide(self.collection, self.supervision, &rows, &given, discovered)
+        });
+        let kept = kept.unwrap_or_default();
+        let labels: Vec<LabelId> = given.iter().chain(kept.ids()).copied().collect();
+        let edits = kept.edits(&self.model.labels, &labels);
+        let k = labels.len();
+        let mut model = LabelModel {
+            labels,
+            ..self.model.clone()
+        };
         let fit_shapes: Vec<FitShape<'_>> = members
             .iter()
             .zip(&views)
@@ -256,7 +265,6 @@ impl Fit<'_> {
             })
             .collect();
         let statistics = self.evidence_elsewhere(&model)?;
-        let discovered = self.discovered_statistics(&model)?;
         let further = FurtherEvidence {
             statistics: &statistics,
             n_training: self.n_training(&members)?,
@@ -279,8 +287,9 @@ impl Fit<'_> {
             .collect();
         let shapes = self.collection.shapes();
         let trained = members.iter().map(|m| shapes[m.at].ordinal).collect();
-        let supervision = self.supervision.clone().fitted(trained);
+        let supervision = kept.supervision(self.supervision.clone()).fitted(trained);
         Ok(Change {
+            labels: edits,
             relabelled: changed.into_iter().collect::<Result<_>>()?,
             stale: members.iter().map(|m| (m.known.row.id, false)).collect(),
             model: Some(model),
@@ -289,11 +298,12 @@ impl Fit<'_> {
         })
     }
 
-    /// Returns the labels of the new model's classes.
+    /// Returns the labels of the new model's classes, without discovered ones that are kept because
+    /// no labelled face shows them.
     fn labels(&self) -> Result<Vec<LabelId>> {
         let used = used_labels(self.collection, self.sources, None)?;
         let mut labels: BTreeSet<LabelId> = used.labels;
-        if !self.supervision.is_closed() {
+        if self.supervision.is_open() {
             labels.extend(self.resolved_discovered()?);
         }
         Ok(labels.into_iter().collect())
@@ -320,7 +330,7 @@ impl Fit<'_> {
             let shape = &self.collection.shapes()[*at];
             let pins = self.pins(*at)?;
             let version = self.supervision.discovered().version_of(shape.ordinal);
-            let discovered = match version.filter(|_| !self.supervision.is_closed()) {
+            let discovered = match version.filter(|_| self.supervision.is_open()) {
                 Some(version) => self.discovered_probabilities(&known, version, labels)?,
                 None => Vec::new(),
             };
@@ -393,7 +403,7 @@ impl Fit<'_> {
         for (at, shape) in self.collection.shapes().iter().enumerate() {
             let is_training = shape.pinned && !self.chosen.contains(&at);
             let version = self.supervision.discovered().version_of(shape.ordinal);
-            let version = version.filter(|_| !self.supervision.is_closed());
+            let version = version.filter(|_| self.supervision.is_open());
             if !is_training && version.is_none() {
                 continue;
             }
@@ -437,11 +447,36 @@ impl Fit<'_> {
         Ok(n)
     }
 
-    /// Returns statistics of the discovered labels at the end of discovery, if shapes cannot have
-    /// those labels any more; `None` also if there were fewer than two labels.
-    fn discovered_statistics(&self, model: &LabelModel) -> Result<Option<Statistics>> {
+    /// Returns the discovered labels beside the person's classes on the members, if a person
+    /// labelled whole shapes; `None` also if there were fewer than two discovered labels.
+    fn discovered_labels(
+        &self,
+        members: &[Member],
+        prepared: &[Arc<Prepared>],
+        k: usize,
+    ) -> Result<Option<DiscoveredLabels>> {
+        let Some(statistics) = self.discovered_statistics()? else {
+            return Ok(None);
+        };
+        let pinned = members.iter().zip(prepared);
+        let pinned = pinned.filter(|(m, _)| !m.pinned_classes.is_empty());
+        let pinned = pinned.map(|(member, prepared)| Pinned {
+            surface: &prepared.surface,
+            features: &prepared.features,
+            classes: &member.pinned_classes,
+        });
+        Ok(Some(DiscoveredLabels {
+            overlap: Overlap::new(&statistics, pinned, k),
+            statistics,
+            own: Vec::new(),
+        }))
+    }
+
+    /// Returns statistics of the discovered labels at the end of discovery.
+    fn discovered_statistics(&self) -> Result<Option<Statistics>> {
+        let model = self.model;
         let k = self.supervision.discovered().labels.len();
-        if !self.supervision.is_closed() || k < 2 {
+        if self.supervision.is_open() || k < 2 {
             return Ok(None);
         }
         let mut discovered = Statistics::empty(k, model.normalisation.mean.len());
@@ -470,18 +505,4 @@ impl Fit<'_> {
 /// Returns the class of the highest probability; of equal ones the first.
 fn most_likely(row: &[u8]) -> Option<usize> {
     (0..row.len()).max_by(|&a, &b| row[a].cmp(&row[b]).then(b.cmp(&a)))
-}
-
-/// Returns the label to which an id resolves after merges.
-fn resolved(rows: &[LabelRow], id: LabelId) -> LabelId {
-    let into = |id: LabelId| rows.iter().find(|l| l.id == id).and_then(|l| l.merged_into);
-    let mut id = id;
-    // A chain has at most as many links as there are labels.
-    for _ in 0..rows.len() {
-        match into(id) {
-            Some(next) => id = next,
-            None => break,
-        }
-    }
-    id
 }

@@ -9,6 +9,7 @@
 pub(super) mod chosen;
 pub(super) mod discovered;
 pub(super) mod fit;
+mod kept;
 mod model_state;
 pub(super) mod state;
 mod stored;

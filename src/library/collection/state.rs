@@ -92,9 +92,12 @@ pub(in crate::library) struct Supervision {
 /// Which labels shapes can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::library) enum Vocabulary {
-    /// Labels that persons used, and labels that were discovered before.
+    /// Labels that persons used, and every label that was discovered before.
     Open,
-    /// Labels that persons used, because a person labelled a whole shape.
+    /// Labels that persons used and, because a person labelled a whole shape, only those discovered
+    /// labels that no labelled face shows.
+    Covered,
+    /// Labels that persons used, because a person said that there are no others.
     Closed,
 }
 
@@ -116,6 +119,8 @@ pub(in crate::library) struct Discovered {
     pub(in crate::library) versions: Vec<(u64, u64)>,
     /// Label of each class in the probabilities of those versions.
     pub(in crate::library) labels: Vec<LabelId>,
+    /// Labels of these that shapes can still have, although a person labelled whole shapes.
+    pub(in crate::library) kept: Vec<LabelId>,
 }
 
 impl Discovered {
@@ -196,6 +201,20 @@ impl Supervision {
         }
     }
 
+    /// Returns the supervision with the discovered labels `kept` by a fit, and other ids of some of
+    /// them: `renumbered` has indices and ids.
+    pub(super) fn keeping(
+        mut self,
+        kept: &[LabelId],
+        renumbered: impl Iterator<Item = (usize, LabelId)>,
+    ) -> Self {
+        self.discovered.kept = kept.to_vec();
+        for (at, id) in renumbered {
+            self.discovered.labels[at] = id;
+        }
+        self
+    }
+
     /// Returns the supervision after the model was fitted to the shapes with these ordinals.
     pub(in crate::library) fn fitted(self, trained: Vec<u64>) -> Self {
         Self {
@@ -233,7 +252,12 @@ impl Supervision {
         &self.discovered
     }
 
-    pub(in crate::library) fn is_closed(&self) -> bool {
-        self.vocabulary == Vocabulary::Closed
+    pub(in crate::library) fn vocabulary(&self) -> Vocabulary {
+        self.vocabulary
+    }
+
+    /// Returns whether shapes can have every discovered label.
+    pub(in crate::library) fn is_open(&self) -> bool {
+        self.vocabulary == Vocabulary::Open
     }
 }

@@ -40,10 +40,16 @@ struct StoredPropagation {
 struct StoredSupervision {
     pending: bool,
     normalised: bool,
+    /// Whether the discovered labels that labelled faces show are no labels of their own any more.
     closed: bool,
+    /// Whether a person said that there are no labels but those that persons used.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    complete: bool,
     taught: Vec<u64>,
     discovered: Vec<(u64, u64)>,
     discovered_labels: Vec<u32>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    kept: Vec<u32>,
 }
 
 impl State {
@@ -110,9 +116,10 @@ impl From<State> for StoredState {
 
 impl From<StoredSupervision> for Supervision {
     fn from(stored: StoredSupervision) -> Self {
-        let vocabulary = match stored.closed {
-            true => Vocabulary::Closed,
-            false => Vocabulary::Open,
+        let vocabulary = match (stored.closed, stored.complete) {
+            (_, true) => Vocabulary::Closed,
+            (true, false) => Vocabulary::Covered,
+            (false, false) => Vocabulary::Open,
         };
         let phase = match (stored.pending, stored.normalised) {
             (false, _) => Phase::Fitted,
@@ -122,6 +129,7 @@ impl From<StoredSupervision> for Supervision {
         let discovered = Discovered {
             versions: stored.discovered,
             labels: stored.discovered_labels,
+            kept: stored.kept,
         };
         Self::stored(vocabulary, phase, stored.taught, discovered)
     }
@@ -132,10 +140,12 @@ impl From<&Supervision> for StoredSupervision {
         Self {
             pending: supervision.phase() != Phase::Fitted,
             normalised: supervision.phase() != Phase::Outdated,
-            closed: supervision.is_closed(),
+            closed: !supervision.is_open(),
+            complete: supervision.vocabulary() == Vocabulary::Closed,
             taught: supervision.trained().to_vec(),
             discovered: supervision.discovered().versions.clone(),
             discovered_labels: supervision.discovered().labels.clone(),
+            kept: supervision.discovered().kept.clone(),
         }
     }
 }

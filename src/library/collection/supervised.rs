@@ -86,7 +86,7 @@ pub(in crate::library) fn refit(
         return Ok(None);
     };
     let used = used_labels(collection, sources, removed.map(Instead::Removed))?;
-    let is_discovered = !supervision.is_closed() && !supervision.discovered().labels.is_empty();
+    let is_discovered = supervision.is_open() && !supervision.discovered().labels.is_empty();
     let can_fit = !used.labels.is_empty() || is_discovered;
     Ok(can_fit.then(|| supervision.clone().outdated(used.vocabulary)))
 }

@@ -303,7 +303,7 @@ fn a_collection_is_discovered_and_corrected_without_a_store() {
     // The first shape becomes a training shape, whose labels are already those of the person.
     let id = collection.shapes[0].id;
     let truth: Vec<i32> = shapes[0].labels.iter().map(|l| *l as i32 + 10).collect();
-    let state = supervised::corrected(&collection, &memory, Vocabulary::Closed).expect("a state");
+    let state = supervised::corrected(&collection, &memory, Vocabulary::Covered).expect("a state");
     let correction = Change {
         pins: vec![(id, Some(truth))],
         staleness: Staleness::All,

@@ -86,11 +86,13 @@ impl Reader<'_> {
     }
 
     /// For each label the number of shapes of a collection whose newest labels contain it.
-    pub fn label_uses(&self, collection: CollectionId) -> Result<BTreeMap<u32, u64>> {
-        let sql = "SELECT label, count(*) FROM shape_labels JOIN shapes ON shapes.id = shape_id
+    pub fn label_uses(&self, collection: CollectionId) -> Result<BTreeMap<u32, (u64, f64)>> {
+        let sql = "SELECT label, count(*), total(area_share) FROM shape_labels JOIN shapes ON shapes.id = shape_id
                    WHERE collection_id = ?1 GROUP BY label";
         let mut statement = self.connection().prepare_cached(sql)?;
-        let uses = statement.query_map([collection], |row| Ok((row.get(0)?, row.get(1)?)))?;
+        let uses = statement.query_map([collection], |row| {
+            Ok((row.get(0)?, (row.get(1)?, row.get(2)?)))
+        })?;
         Ok(uses.collect::<rusqlite::Result<_>>()?)
     }
 

@@ -62,6 +62,7 @@ fn correction(shape: &str) -> Body {
         shape: shape.to_owned(),
         correction: Some(Correction::Part(part)),
         by: String::new(),
+        closed: None,
     })
 }
 

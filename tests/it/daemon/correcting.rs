@@ -62,6 +62,7 @@ fn correct_request(shape: &str, labels: &[i32]) -> (wire::CorrectLabelsRequest, 
         shape: shape.to_owned(),
         correction: Some(Correction::Labels(labels)),
         by: String::new(),
+        closed: None,
     };
     (request, frames)
 }

@@ -40,6 +40,7 @@ fn send_each_again_and_again(seed: u64) {
         shape: "a".to_owned(),
         correction: Some(wire::correct_labels_request::Correction::Part(part)),
         by: String::new(),
+        closed: None,
     });
     let name = Body::NameLabel(wire::NameLabelRequest {
         collection: c(),

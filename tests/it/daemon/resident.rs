@@ -91,6 +91,7 @@ fn round(daemon: &Daemon, client: &mut Client, n: u64) {
                     shape: "x".to_owned(),
                     correction,
                     by: String::new(),
+                    closed: None,
                 };
                 call!(client, CorrectLabels(request)).unwrap();
             }

@@ -168,6 +168,7 @@ fn deadlines_are_kept_whatever_keeps_the_collection_busy() {
             shape: "a".to_owned(),
             correction: Some(wire::correct_labels_request::Correction::Part(part)),
             by: String::new(),
+            closed: None,
         }),
         // Behind the correction, waiting for the collection.
         Body::Undo(wire::UndoRequest { collection: c() }),

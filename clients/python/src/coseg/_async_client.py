@@ -584,10 +584,13 @@ class AsyncCollection:
         faces: ArrayLike | None = None,
         part: int | None = None,
         label: int | str | None = None,
+        closed: bool | None = None,
     ) -> t.Corrected:
         """Labels faces of a shape by hand: ``labels`` for all of them (−1 leaves one alone), or one
         ``label`` (id or name) for some ``faces`` or one ``part``. They never change again by themselves;
-        other shapes follow in the background: :meth:`wait_idle`."""
+        other shapes follow in the background: :meth:`wait_idle`. With ``closed=True`` there are no labels
+        but those that persons used; with ``False`` discovered labels that no labelled shape shows are
+        labels too; ``None`` leaves that as it is."""
         writer = FrameWriter()
         fields: dict[str, Any]
         if labels is not None and faces is None and part is None and label is None:
@@ -599,6 +602,8 @@ class AsyncCollection:
             fields = {"part": {"part": part, "label": await self._label(label)}}
         else:
             raise ValueError("give labels, or faces and label, or part and label")
+        if closed is not None:
+            fields["closed"] = closed
         reply, _ = await self._call("correct_labels", writer.frames, shape=name, **fields)
         return wire.flat(t.Corrected, reply)
 

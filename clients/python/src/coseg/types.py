@@ -74,6 +74,10 @@ class Label:
     merged_into: int | None
     #: Shapes that carry it; 0: out of use.
     n_shapes: int
+    #: Mean over all shapes of the share of their area that has it, 0 to 1.
+    area_share: float
+    #: Whether it is a discovered label that no labelled shape shows, and that nobody has named.
+    unclaimed: bool
 
 
 @dataclass(frozen=True)
