@@ -3,11 +3,13 @@
 mod care;
 mod maps;
 mod corrections;
+mod links;
 mod looking;
 mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+pub(crate) use links::{LinkParts, Links, Unlink};
 pub(crate) use looking::{Top, Usd, View};
 pub(crate) use maps::{Map, Resolution, Transfer};
 pub(crate) use questions::{AnswerQuestion, Approve, Ask, Verdict};
@@ -154,8 +156,16 @@ pub(crate) enum Command {
     Merge(Merge),
     /// Split one label into two
     Split(Split),
-    /// Undo the newest correction, answer, verdict, name, merge, split or change of the up axis;
-    /// repeat to go further back
+    /// Demand that two parts have the same label
+    Same(LinkParts),
+    /// Demand that two parts have different labels
+    Differ(LinkParts),
+    /// List the links between parts that `coseg same` and `coseg differ` made
+    Links(Links),
+    /// Remove a link between parts
+    Unlink(Unlink),
+    /// Undo the newest correction, answer, verdict, name, merge, split, link or change of the up
+    /// axis; repeat to go further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]

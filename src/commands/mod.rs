@@ -21,6 +21,7 @@ mod jobs;
 mod keys;
 mod label_file;
 mod labels;
+mod links;
 mod ls;
 mod man;
 mod map;
@@ -55,7 +56,7 @@ use coseg::ipc::client::ClientError;
 use coseg::ipc::endpoint::EndpointError;
 use coseg::ipc::json;
 use coseg::ipc::keys::KeyError;
-use coseg::ipc::wire::ErrorReason;
+use coseg::ipc::wire::{ErrorReason, LinkKind};
 use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
@@ -145,6 +146,9 @@ impl CommandError {
             ErrorReason::NoLabel | ErrorReason::LabelMerged => {
                 "`coseg show --collection NAME` lists the labels"
             }
+            ErrorReason::LinkContradicts | ErrorReason::LinkLimit | ErrorReason::NoLink => {
+                "`coseg links` lists the links, and `coseg unlink` removes one"
+            }
             ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
             ErrorReason::Draining => "start the daemon again; it resumes the accepted work",
             ErrorReason::ReadOnly | ErrorReason::Damaged => {
@@ -201,6 +205,10 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Correct(args) => correct::run(args, session()?),
         Command::Merge(args) => merge::merge(args, session()?),
         Command::Split(args) => merge::split(args, session()?),
+        Command::Same(args) => links::link(args, LinkKind::Same, session()?),
+        Command::Differ(args) => links::link(args, LinkKind::Differ, session()?),
+        Command::Links(args) => links::list(args, session()?),
+        Command::Unlink(args) => links::unlink(args, session()?),
         Command::Undo(args) => undo::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
         Command::Synth(args) => synth::run(args, cli.global.json)

@@ -160,6 +160,7 @@ operations! {
             GetShape(GetShapeRequest),
             GetLabels(GetLabelsRequest),
             EventsSince(EventsSinceRequest),
+            ListLinks(ListLinksRequest),
         }
         /// Answered with whole files or arrays.
         Fetch {
@@ -205,6 +206,8 @@ operations! {
             ReviewShape(ReviewShapeRequest) checked by check_review,
             MergeLabels(MergeLabelsRequest),
             SplitLabel(SplitLabelRequest),
+            LinkParts(LinkPartsRequest) checked by check_link,
+            UnlinkParts(UnlinkPartsRequest),
             Undo(UndoRequest),
             RemoveShape(RemoveShapeRequest),
         }

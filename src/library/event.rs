@@ -1,5 +1,6 @@
 //! The events of a collection, as they are logged and published.
 
+use super::linked::{LinkKind, PartName};
 use super::types::LabelId;
 use serde::{Deserialize, Serialize};
 
@@ -99,6 +100,20 @@ pub enum EventKind {
         /// The new axis.
         to: String,
     },
+    /// A person linked two parts: they must have the same label, or different ones.
+    PartsLinked {
+        /// Id of the link.
+        link: u64,
+        /// What it demands.
+        kind: LinkKind,
+        /// The parts.
+        parts: [PartName; 2],
+    },
+    /// A person removed a link between two parts.
+    PartsUnlinked {
+        /// Id of the link.
+        link: u64,
+    },
     /// The parts of the collection were clustered again.
     Reclustered {
         /// Score of the old labelling; see docs/methods.md.
@@ -127,6 +142,8 @@ impl EventKind {
             Self::Corrected { .. } => "corrected",
             Self::Undone { .. } => "undone",
             Self::UpChanged { .. } => "up_changed",
+            Self::PartsLinked { .. } => "parts_linked",
+            Self::PartsUnlinked { .. } => "parts_unlinked",
             Self::Reclustered { .. } => "reclustered",
         }
     }

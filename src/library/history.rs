@@ -18,10 +18,10 @@ use serde::{Deserialize, Serialize};
 /// The result of undoing a change.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
-    /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split` or
-    /// `up`.
+    /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split`,
+    /// `up`, `same`, `differ` or `unlink`.
     pub change: String,
-    /// What the change concerned: a shape, a label or an axis; empty in a reply that an earlier
+    /// What the change concerned: a shape, a label, an axis or two parts; empty in a reply that an earlier
     /// version stored.
     #[serde(default)]
     pub subject: String,
@@ -33,7 +33,7 @@ pub struct Undone {
 
 impl Library {
     /// Undoes the newest change that a person made to a collection: a correction, a name, a merge,
-    /// a split or another up axis. Shapes get the labels back that they had before it; shapes that
+    /// a split, another up axis or a link. Shapes get the labels back that they had before it; shapes that
     /// were added since are relabelled. Can be repeated, back to the first change. Cannot itself be
     /// undone.
     ///
@@ -76,7 +76,7 @@ impl Library {
 /// Returns the subject of a change from its stored details.
 fn subject(detail: &str) -> String {
     let detail: serde_json::Value = serde_json::from_str(detail).unwrap_or_default();
-    let found = ["shape", "label", "from"]
+    let found = ["shape", "label", "from", "parts"]
         .iter()
         .find_map(|key| detail.get(key));
     match found {
@@ -109,6 +109,8 @@ fn undoing(
             None => LabelEdit::Retired(label.id),
         });
     }
+    let is_there = |shape: ShapeId| collection.position(shape).is_some();
+    change.links = before.link_edits(&sources.links(collection.id())?, &is_there);
     let Some(rest) = &before.rest else {
         return Ok(change);
     };

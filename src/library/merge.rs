@@ -53,6 +53,7 @@ impl Library {
             let labels = self.store.labels(id)?;
             require_in_use(&labels, label)?;
             require_in_use(&labels, into)?;
+            self.check_merge(collection, (label, into))?;
             let catalog = self.store.catalog();
             let labelled = catalog.read(|r| r.shapes(id, 0, usize::MAX, Some(label)))?;
             let labelled: Vec<ShapeId> = labelled.into_iter().map(|s| s.id).collect();
@@ -181,7 +182,7 @@ fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Resu
     let new = collection.row().next_label;
     let supervision = collection.state().regime.supervision();
     let is_closed = supervision.is_some_and(Supervision::is_closed);
-    let members = fit::members(collection);
+    let members = fit::members(collection, &sources.links(collection.id())?);
     let chosen: Vec<usize> = (0..shapes.len())
         .filter(|at| shapes[*at].pinned || !is_closed && members.contains(at))
         .collect();

@@ -3,8 +3,8 @@
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
-    Baseline, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Normalisation,
-    ShapeInput, Statistics, baseline, discover,
+    Baseline, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Links,
+    Normalisation, ShapeInput, Statistics, baseline, discover,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -32,6 +32,8 @@ pub struct ReclusterOptions {
     pub min_gain: f64,
     /// The first label id that was never used.
     pub next_label: u32,
+    /// Demands of a person that the new labels must meet.
+    pub links: Links,
 }
 
 /// A change of label ids in a re-clustering.
@@ -81,7 +83,10 @@ pub fn recluster(
 ) -> Reclustering {
     let views: Vec<DescriptionView<'_>> = shapes.iter().map(|s| s.shape).collect();
     let together = Together::new(&views, options.up);
-    let input = together.input();
+    let input = DiscoveryInput {
+        links: options.links.clone(),
+        ..together.input()
+    };
     let Together {
         normalisation,
         prepared,
@@ -178,6 +183,7 @@ impl Together {
                 })
                 .collect(),
             up_known: self.normalisation.up_known,
+            links: Links::default(),
         }
     }
 }

@@ -78,6 +78,9 @@ CALLS: dict[str, Call] = {
     "next_question": lambda _, c: c.ask(),
     "answer_question": lambda _, c: c.answer("a", 0, 1),
     "review_shape": lambda _, c: c.approve("a"),
+    "link_parts": lambda _, c: c.same(("a", 0), ("b", 1)),
+    "unlink_parts": lambda _, c: c.unlink(1),
+    "list_links": lambda _, c: c.links("a"),
 }
 
 

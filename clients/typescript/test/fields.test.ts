@@ -80,6 +80,9 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   nextQuestion: (_, c) => c.ask(),
   answerQuestion: (_, c) => c.answer("a", 0, { label: 1 }),
   reviewShape: (_, c) => c.approve("a"),
+  linkParts: (_, c) => c.same({ shape: "a", part: 0 }, { shape: "b", part: 1 }),
+  unlinkParts: (_, c) => c.unlink(1),
+  listLinks: (_, c) => c.links("a"),
 };
 
 /** The result, or what is wrong with a reply that has other rows than requested. */

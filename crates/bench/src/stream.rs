@@ -12,7 +12,7 @@ use coseg::ipc::wire::{
     self, correct_labels_request::Correction, reply, request, shape_input::Source,
 };
 use coseg::labels::score::{Score, ScoredShape, accuracy_by_id, score};
-use coseg::labels::{Baseline, DiscoveryOptions};
+use coseg::labels::{Baseline, DiscoveryOptions, Links};
 use coseg::library::Library;
 use coseg::mesh::{self, Format, TriMesh};
 use coseg::pipeline::{
@@ -432,6 +432,7 @@ fn without_maps(views: &[DescriptionView<'_>], k: usize, up: Option<[f64; 3]>) -
                 up,
                 min_gain: coseg::library::min_gain(n + 1),
                 next_label: used,
+                links: Links::default(),
             };
             let outcome = recluster(&shapes, model.as_ref(), n as u64 + 1, &options);
             next_recluster = coseg::library::next_recluster(n as u64 + 1) as usize;

@@ -111,6 +111,15 @@ pub(super) fn edit(
             let label = Some(convert::label_info(&label));
             Reply::SplitLabel(wire::SplitLabelReply { label, n_shapes })
         }
+        Edit::LinkParts(r) => {
+            let (kind, parts) = convert::new_link(&r)?;
+            let done = library.link_parts(&r.collection, kind, &parts, &r.by, key);
+            Reply::LinkParts(convert::linked(&done.map_err(refused)?))
+        }
+        Edit::UnlinkParts(r) => {
+            let done = library.unlink_parts(&r.collection, r.id, key);
+            Reply::UnlinkParts(convert::unlinked(&done.map_err(refused)?))
+        }
         Edit::Undo(r) => {
             let undone = library.undo(&r.collection, key).map_err(refused)?;
             Reply::Undo(convert::undone(&undone))

@@ -1,5 +1,6 @@
 //! Defines the changes by persons that can be undone, as the catalog names them.
 
+use crate::library::linked::LinkKind;
 use crate::library::rows::to_json;
 use crate::library::types::LabelId;
 use crate::store::catalog::KIND_NAME;
@@ -15,6 +16,8 @@ pub(in crate::library) enum Undoable {
     Merge { label: LabelId, into: LabelId },
     Split { label: LabelId, new: LabelId },
     Up { from: String, to: String },
+    Link { kind: LinkKind, parts: String },
+    Unlink { parts: String },
 }
 
 impl Undoable {
@@ -29,6 +32,8 @@ impl Undoable {
             Self::Merge { .. } => "merge",
             Self::Split { .. } => "split",
             Self::Up { .. } => "up",
+            Self::Link { kind, .. } => kind.name(),
+            Self::Unlink { .. } => "unlink",
         }
     }
 
@@ -42,6 +47,9 @@ impl Undoable {
             Self::Name => serde_json::json!({}),
             Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
             Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
+            Self::Link { parts, .. } | Self::Unlink { parts } => {
+                serde_json::json!({ "parts": parts })
+            }
             Self::Up { from, to } => serde_json::json!({ "from": from, "to": to }),
         };
         to_json(&detail)

@@ -11,7 +11,7 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are rejected.
-pub const CATALOG_FORMAT: u32 = 4;
+pub const CATALOG_FORMAT: u32 = 6;
 
 /// The format before corrections: it lacks the tables in [`SINCE_FORMAT_2`].
 const WITHOUT_CORRECTIONS: u32 = 1;
@@ -22,6 +22,9 @@ const WITHOUT_CONFIDENCE: u32 = 2;
 
 /// The format before verdicts of persons: it lacks the tables in [`SINCE_FORMAT_4`].
 const WITHOUT_REVIEWS: u32 = 3;
+
+/// The format before links between parts: it lacks the table in [`SINCE_FORMAT_6`].
+const WITHOUT_LINKS: u32 = 4;
 
 /// `cseg`, the application id in the header of the SQLite file.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -176,6 +179,17 @@ tables! {
     "shape_id INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part INTEGER NOT NULL,
      why TEXT NOT NULL, sum INTEGER, PRIMARY KEY (shape_id, part)"
 
+    LINKS "links" key 1 [
+        "id", "collection_id", "kind", "shape_a", "part_a", "polygons_a", "shape_b", "part_b",
+        "polygons_b", "person", "unix_ms",
+    ]
+    "id INTEGER PRIMARY KEY AUTOINCREMENT,
+     collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE, kind TEXT NOT NULL,
+     shape_a INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part_a INTEGER NOT NULL,
+     polygons_a BLOB NOT NULL,
+     shape_b INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part_b INTEGER NOT NULL,
+     polygons_b BLOB NOT NULL, person TEXT NOT NULL, unix_ms INTEGER NOT NULL, sum INTEGER"
+
     LABELS_BEFORE "labels_before" key 2 [
         "correction_id", "shape_id", "version", "label_epoch", "parts", "area_shares",
     ]
@@ -243,6 +257,16 @@ const INDEXES_SINCE_FORMAT_3: &str = "
 /// Tables that format 4 added.
 const SINCE_FORMAT_4: [&Table; 2] = [&REVIEWS, &PASSED_PARTS];
 
+/// The table that format 6 added.
+const SINCE_FORMAT_6: [&Table; 1] = [&LINKS];
+
+/// Indexes of this table, by which the removal of a shape finds its links.
+const INDEXES_SINCE_FORMAT_6: &str = "
+    CREATE INDEX links_by_collection ON links (collection_id, id);
+    CREATE INDEX links_by_a ON links (shape_a);
+    CREATE INDEX links_by_b ON links (shape_b);
+";
+
 const INDEXES: &str = "
     CREATE INDEX stale_shapes ON shapes (collection_id, ordinal) WHERE stale;
     CREATE INDEX shapes_by_content ON shapes (content_digest);
@@ -297,6 +321,7 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     tx.execute_batch(INDEXES)?;
     tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
     tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
+    tx.execute_batch(INDEXES_SINCE_FORMAT_6)?;
     tx.execute(
         "INSERT INTO meta (key, value) VALUES ('library_id', lower(hex(randomblob(16)))), (?1, ?2)",
         params!["format", CATALOG_FORMAT.to_string()],
@@ -315,7 +340,7 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     let found = pragma("user_version")?;
     let is_old = matches!(
         found,
-        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS
+        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS | WITHOUT_LINKS
     );
     if pragma("application_id")? != APPLICATION_ID || !is_old {
         return Ok(());
@@ -333,9 +358,15 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
         }
         tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
     }
-    for table in SINCE_FORMAT_4 {
+    if found < WITHOUT_LINKS {
+        for table in SINCE_FORMAT_4 {
+            tx.execute_batch(&table.create())?;
+        }
+    }
+    for table in SINCE_FORMAT_6 {
         tx.execute_batch(&table.create())?;
     }
+    tx.execute_batch(INDEXES_SINCE_FORMAT_6)?;
     tx.execute(
         "UPDATE meta SET value = ?1 WHERE key = 'format'",
         [CATALOG_FORMAT.to_string()],

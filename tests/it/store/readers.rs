@@ -102,20 +102,21 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
             .execute_batch(sql)
             .expect("runs");
     };
+    let since_6 = "DROP TABLE links;";
     let since_4 = "DROP TABLE reviews; DROP TABLE passed_parts;";
     let since_3 = "DROP TABLE point_maps; DROP TABLE map_confidence;";
     let since_2 = "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;";
-    old(&format!("{since_4} PRAGMA user_version = 3"));
-    drop(Store::open(&library)?);
-    assert_eq!(format(), 4);
-    old(&format!("{since_4} {since_3} PRAGMA user_version = 2"));
-    drop(Store::open(&library)?);
-    assert_eq!(format(), 4);
-    old(&format!(
-        "{since_4} {since_3} {since_2} PRAGMA user_version = 1"
-    ));
+    for (dropped, of_format) in [
+        (since_6.to_owned(), 4),
+        (format!("{since_6} {since_4}"), 3),
+        (format!("{since_6} {since_4} {since_3}"), 2),
+        (format!("{since_6} {since_4} {since_3} {since_2}"), 1),
+    ] {
+        old(&format!("{dropped} PRAGMA user_version = {of_format}"));
+        drop(Store::open(&library)?);
+        assert_eq!(format(), 6, "from format {of_format}");
+    }
     let store = Store::open(&library)?;
-    assert_eq!(format(), 4);
     let new = coseg::store::NewCollection {
         name: "old".into(),
         ..Default::default()
