@@ -3,7 +3,7 @@
 //! itself; the shapes are generated here.
 
 use coseg::Library;
-use coseg::labels::{DiscoveryOptions, LabelModel};
+use coseg::labels::{DiscoveryOptions, LabelModel, Links};
 use coseg::library::{CollectionSpec, Correction, MAX_BATCH, NewShape};
 use coseg::mesh::{Format, write};
 use coseg::pipeline::{
@@ -78,6 +78,7 @@ fn options(next_label: u32) -> ReclusterOptions {
         up: None,
         min_gain: 0.0,
         next_label,
+        links: Links::default(),
     }
 }
 

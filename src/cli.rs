@@ -3,12 +3,14 @@
 mod care;
 mod maps;
 mod corrections;
+mod links;
 mod looking;
 mod proposals;
 mod questions;
 
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
+pub(crate) use links::{LinkParts, Links, Unlink};
 pub(crate) use looking::{Top, Usd, View};
 pub(crate) use maps::{Map, Resolution, Transfer};
 pub(crate) use proposals::{Choose, Proposals};
@@ -160,8 +162,16 @@ pub(crate) enum Command {
     Proposals(Proposals),
     /// Make one of the proposals the labels
     Choose(Choose),
-    /// Undo the newest correction, answer, verdict, name, merge, split, change of the up axis or
-    /// choice; repeat to go further back
+    /// Demand that two parts have the same label
+    Same(LinkParts),
+    /// Demand that two parts have different labels
+    Differ(LinkParts),
+    /// List the links between parts that `coseg same` and `coseg differ` made
+    Links(Links),
+    /// Remove a link between parts
+    Unlink(Unlink),
+    /// Undo the newest correction, answer, verdict, name, merge, split, link, change of the up axis
+    /// or choice; repeat to go further back
     Undo(Undo),
     /// Create, change or delete collections
     #[command(subcommand)]

@@ -103,8 +103,8 @@ pub(crate) fn answer(args: &AnswerQuestion, mut session: Session) -> Outcome {
     Ok(true)
 }
 
-/// A part as `coseg ask` names it.
-fn part(typed: &str) -> Result<(&str, u32), CommandError> {
+/// A part as it is typed: a shape, a colon and a number.
+pub(super) fn part(typed: &str) -> Result<(&str, u32), CommandError> {
     let parsed = typed.rsplit_once(':');
     let parsed = parsed.and_then(|(shape, part)| Some((shape, part.parse().ok()?)));
     parsed.ok_or_else(|| {

@@ -49,10 +49,15 @@ fn collections(session: &mut Session) -> Outcome {
         "parts",
         "up",
         "sequence",
+        "unseen",
+        "corrected",
+        "approved",
+        "doubtful",
     ];
     let mut rows = vec![heading.map(str::to_owned).to_vec()];
     for c in &reply.collections {
         let spec = c.spec.clone().unwrap_or_default();
+        let reviews = c.reviews.unwrap_or_default();
         let n_labels = c.labels.iter().filter(|l| l.n_shapes > 0).count();
         let parts = spec.n_parts.filter(|&n| n > 0);
         rows.push(vec![
@@ -63,6 +68,10 @@ fn collections(session: &mut Session) -> Outcome {
             parts.map_or_else(|| "estimated".to_owned(), |n| n.to_string()),
             up_name(spec.up()).to_owned(),
             c.sequence.to_string(),
+            reviews.unseen.to_string(),
+            reviews.corrected.to_string(),
+            reviews.approved.to_string(),
+            reviews.doubtful.to_string(),
         ]);
     }
     session.line(&table(&rows))?;
@@ -75,23 +84,16 @@ fn shapes(
     session: &mut Session,
 ) -> Outcome {
     let shapes = session.shapes_reviewed(collection, label, review)?;
+    let counts = review_counts(&shapes);
     if session.json {
         let list: Vec<Value> = shapes.iter().map(json::shape).collect();
-        session.print_json(&json!({ "collection": collection, "shapes": list }))?;
+        session.print_json(&json!({
+            "collection": collection,
+            "shapes": list,
+            "reviews": json::review_counts(&counts),
+        }))?;
         return Ok(true);
     }
-    let mut counts = std::collections::BTreeMap::<String, usize>::new();
-    for s in &shapes {
-        let state = s
-            .review
-            .as_ref()
-            .map_or_else(Default::default, |r| r.state());
-        *counts.entry(json::review_state(state)).or_default() += 1;
-    }
-    let counts: Vec<String> = counts
-        .iter()
-        .map(|(state, n)| format!("{n} {state}"))
-        .collect();
     let heading = [
         "shape", "faces", "parts", "labels", "version", "state", "review",
     ];
@@ -114,6 +116,28 @@ fn shapes(
         ]);
     }
     session.line(&table(&rows))?;
-    eprintln!("{}", counts.join(", "));
+    eprintln!("{}", reviews_text(&counts));
     Ok(true)
+}
+
+/// Counts shapes by verdict.
+fn review_counts(shapes: &[wire::Shape]) -> wire::ReviewCounts {
+    let mut counts = wire::ReviewCounts::default();
+    for shape in shapes {
+        let state = shape.review.as_ref().map(wire::Review::state);
+        *match state.unwrap_or(wire::ReviewState::Unseen) {
+            wire::ReviewState::Unspecified | wire::ReviewState::Unseen => &mut counts.unseen,
+            wire::ReviewState::Corrected => &mut counts.corrected,
+            wire::ReviewState::Approved => &mut counts.approved,
+            wire::ReviewState::Doubtful => &mut counts.doubtful,
+        } += 1;
+    }
+    counts
+}
+
+fn reviews_text(counts: &wire::ReviewCounts) -> String {
+    format!(
+        "{} unseen, {} corrected, {} approved, {} doubtful",
+        counts.unseen, counts.corrected, counts.approved, counts.doubtful
+    )
 }

@@ -21,6 +21,7 @@ mod jobs;
 mod keys;
 mod label_file;
 mod labels;
+mod links;
 mod ls;
 mod man;
 mod map;
@@ -56,7 +57,7 @@ use coseg::ipc::client::ClientError;
 use coseg::ipc::endpoint::EndpointError;
 use coseg::ipc::json;
 use coseg::ipc::keys::KeyError;
-use coseg::ipc::wire::ErrorReason;
+use coseg::ipc::wire::{ErrorReason, LinkKind};
 use coseg::library::LibraryError;
 use session::Session;
 use std::process::ExitCode;
@@ -147,6 +148,9 @@ impl CommandError {
                 "`coseg show --collection NAME` lists the labels"
             }
             ErrorReason::ProposalsChanged => "`coseg proposals NAME` lists the present ones",
+            ErrorReason::LinkContradicts | ErrorReason::LinkLimit | ErrorReason::NoLink => {
+                "`coseg links` lists the links, and `coseg unlink` removes one"
+            }
             ErrorReason::PartIndex => "`coseg show SHAPE` lists the parts",
             ErrorReason::Draining => "start the daemon again; it resumes the accepted work",
             ErrorReason::ReadOnly | ErrorReason::Damaged => {
@@ -205,6 +209,10 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Split(args) => merge::split(args, session()?),
         Command::Proposals(args) => proposals::run(args, session()?),
         Command::Choose(args) => proposals::choose(args, session()?),
+        Command::Same(args) => links::link(args, LinkKind::Same, session()?),
+        Command::Differ(args) => links::link(args, LinkKind::Differ, session()?),
+        Command::Links(args) => links::list(args, session()?),
+        Command::Unlink(args) => links::unlink(args, session()?),
         Command::Undo(args) => undo::run(args, session()?),
         Command::Collections(args) => collections::run(args, session()?),
         Command::Synth(args) => synth::run(args, cli.global.json)

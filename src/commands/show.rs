@@ -3,7 +3,7 @@
 
 use super::collections::warn_of_up;
 use super::session::Session;
-use super::{CommandError, Outcome, json};
+use super::{CommandError, Outcome, json, links};
 use crate::cli::Show;
 use coseg::call;
 use coseg::ipc::convert::up_name;
@@ -16,7 +16,9 @@ pub(crate) fn run(args: &Show, mut session: Session) -> Outcome {
         Some(name) => {
             let found = shape(args, name, &mut session);
             let (shape, collection) = found.map_err(|e| session.explain_shape(e, name))?;
-            show_shape(&shape, &collection, &session)
+            let name = collection.spec.as_ref().map_or("", |s| &s.name);
+            let links = links::of_shape(name, &shape.name, &mut session)?;
+            show_shape(&shape, &collection, &links, &session)
         }
         None => {
             let collection = session.collection(&args.within)?;
@@ -141,9 +143,16 @@ pub(super) fn found(r: &wire::CleanReport) -> String {
     format!("{}, {found}", counted(r.n_components, "component"))
 }
 
-fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session) -> Outcome {
+fn show_shape(
+    s: &wire::Shape,
+    collection: &wire::Collection,
+    links: &[wire::Link],
+    session: &Session,
+) -> Outcome {
     if session.json {
-        session.print_json(&json::shape(s))?;
+        let mut shape = json::shape(s);
+        shape["links"] = links.iter().map(json::link).collect();
+        session.print_json(&shape)?;
         return Ok(true);
     }
     let state = if s.stale { "stale" } else { "current" };
@@ -185,6 +194,10 @@ fn show_shape(s: &wire::Shape, collection: &wire::Collection, session: &Session)
             })
             .collect();
         session.line(&format!("labels propagated from {}", sources.join(", ")))?;
+    }
+    for link in links {
+        let (text, state) = (links::text(link), links::state(link));
+        session.line(&format!("link {}: {text} ({state})", link.id))?;
     }
     Ok(true)
 }

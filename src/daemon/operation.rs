@@ -160,6 +160,7 @@ operations! {
             GetShape(GetShapeRequest),
             GetLabels(GetLabelsRequest),
             EventsSince(EventsSinceRequest),
+            ListLinks(ListLinksRequest),
         }
         /// Answered with whole files or arrays.
         Fetch {
@@ -208,6 +209,8 @@ operations! {
             MergeLabels(MergeLabelsRequest),
             SplitLabel(SplitLabelRequest),
             ChooseProposal(ChooseProposalRequest),
+            LinkParts(LinkPartsRequest) checked by check_link,
+            UnlinkParts(UnlinkPartsRequest),
             Undo(UndoRequest),
             RemoveShape(RemoveShapeRequest),
         }

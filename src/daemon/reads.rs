@@ -49,6 +49,12 @@ pub(crate) fn look(daemon: &Daemon, look: Look) -> Answer {
             Reply::GetLabels(convert::labels(&labels, r.confidence, &mut frames))
         }
         Look::EventsSince(r) => Reply::EventsSince(events_since(daemon, &r)?),
+        Look::ListLinks(r) => {
+            let shape = Some(r.shape.as_str()).filter(|s| !s.is_empty());
+            let links = library.links(&r.collection, shape).map_err(refused)?;
+            let links = links.iter().map(convert::link).collect();
+            Reply::ListLinks(wire::ListLinksReply { links })
+        }
     };
     Ok((result, frames.finish()))
 }

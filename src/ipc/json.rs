@@ -42,7 +42,18 @@ pub fn collection(c: &wire::Collection) -> Value {
         "n_shapes": c.n_shapes,
         "n_stale": c.n_stale,
         "n_undoable": c.n_undoable,
+        "reviews": review_counts(&c.reviews.unwrap_or_default()),
         "labels": c.labels.iter().map(label).collect::<Vec<_>>(),
+    })
+}
+
+/// Numbers of shapes by verdict.
+pub fn review_counts(counts: &wire::ReviewCounts) -> Value {
+    json!({
+        "unseen": counts.unseen,
+        "corrected": counts.corrected,
+        "approved": counts.approved,
+        "doubtful": counts.doubtful,
     })
 }
 
@@ -128,6 +139,29 @@ pub fn proposal(p: &wire::Proposal) -> Value {
         "in_force": p.in_force,
         "differs": p.differs,
     })
+}
+
+/// A link between two parts.
+pub fn link(l: &wire::Link) -> Value {
+    json!({
+        "id": l.id,
+        "kind": link_kind(l.kind()),
+        "a": l.a.as_ref().map(part_of_shape),
+        "b": l.b.as_ref().map(part_of_shape),
+        "by": l.by,
+        "unix_ms": l.unix_ms,
+        "holds": l.holds,
+        "overruled": l.overruled,
+    })
+}
+
+fn part_of_shape(p: &wire::PartOfShape) -> Value {
+    json!({ "shape": p.shape, "part": p.part })
+}
+
+/// What a link demands, in lower case.
+pub fn link_kind(kind: wire::LinkKind) -> String {
+    short(kind.as_str_name(), "LINK_KIND_")
 }
 
 /// The state of a verdict in lower case.
@@ -285,6 +319,16 @@ pub fn event(e: &wire::Event) -> Value {
             });
             ("chosen", body)
         }
+        Some(Kind::PartsLinked(l)) => {
+            let body = json!({
+                "link": l.link,
+                "demand": link_kind(l.kind()),
+                "a": l.a.as_ref().map(part_of_shape),
+                "b": l.b.as_ref().map(part_of_shape),
+            });
+            ("parts_linked", body)
+        }
+        Some(Kind::PartsUnlinked(l)) => ("parts_unlinked", json!({ "link": l.link })),
         Some(Kind::Reclustered(r)) => {
             let body = json!({
                 "score_before": r.score_before,
@@ -359,6 +403,18 @@ pub fn event_line(e: &wire::Event) -> String {
             c.proposal,
             counted(c.n_labels.into(), "label")
         ),
+        Some(Kind::PartsLinked(l)) => {
+            let part = |p: &Option<wire::PartOfShape>| {
+                let part = p.as_ref();
+                part.map_or_else(String::new, |p| format!("{}:{}", p.shape, p.part))
+            };
+            let demand = match l.kind() {
+                wire::LinkKind::Differ => "has another label than",
+                _ => "has the label of",
+            };
+            format!("link {}: {} {demand} {}", l.link, part(&l.a), part(&l.b))
+        }
+        Some(Kind::PartsUnlinked(l)) => format!("link {} removed", l.link),
         Some(Kind::Reclustered(r)) => {
             let taken = if r.accepted { "taken" } else { "not taken" };
             let before = r

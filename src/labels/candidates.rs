@@ -78,7 +78,10 @@ pub(super) fn pool(
         .map(|g| merged_to(k, criterion, g.of_patch, g.n_labels))
         .collect();
     for labels in merged.into_iter().flatten() {
-        found.add(labels);
+        let mut of_shape = [labels];
+        let area = |_, patch: u32| shapes.area[patch as usize];
+        shapes.links.repair(&mut of_shape, k, area);
+        of_shape.into_iter().for_each(|labels| found.add(labels));
     }
     found.labellings
 }

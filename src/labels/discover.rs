@@ -10,10 +10,12 @@ use super::candidates::pool;
 use super::criterion::Criterion;
 use super::cut::cut;
 use super::judge::Judge;
+use super::links::{LinkedFaces, Links};
 use super::patchwise::{Patchwise, in_metric};
 use super::{Features, Statistics};
 use crate::segmentation::{PatchGraph, Surface};
 use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Number of best labellings from which a metric is learned.
 const N_METRIC_SOURCES: usize = 10;
@@ -44,6 +46,8 @@ pub struct DiscoveryInput<'a> {
     pub shapes: Vec<ShapeInput<'a>>,
     /// Whether the features end with the columns of the up axis.
     pub up_known: bool,
+    /// Demands of a person that the labels must meet.
+    pub links: Links,
 }
 
 /// The number of labels and the seed.
@@ -102,6 +106,8 @@ pub(super) struct Prepared<'a> {
     pub(super) offsets: Vec<usize>,
     /// Area share of each patch, summing to the number of shapes.
     pub(super) area: Vec<f64>,
+    /// The demands on patches, all of which count as faces of shape 0.
+    pub(super) links: Links,
 }
 
 impl<'a> Prepared<'a> {
@@ -118,6 +124,7 @@ impl<'a> Prepared<'a> {
             offsets.push(area.len());
         }
         Self {
+            links: on_patches(input, &offsets),
             input,
             dim,
             up_known: input.up_known,
@@ -208,12 +215,15 @@ pub fn discover(
     }
     let shapes = Prepared::new(input);
     let criterion = shapes.criterion();
+    let fewest = fewest_labels(&input.links);
     let pool = match options.n_labels {
-        Some(k) => (k, pool(&shapes, &criterion, k, options.seed)),
+        Some(k) if k >= fewest => (k, pool(&shapes, &criterion, k, options.seed)),
+        Some(_) => (fewest, pool(&shapes, &criterion, fewest, options.seed)),
         None => estimate(&shapes, &criterion, options),
     };
+    let k = pool.0;
     let chosen = choose(&shapes, &criterion, pool, options.seed, current);
-    chosen.unwrap_or_else(|| {
+    let mut found = chosen.unwrap_or_else(|| {
         // With fewer patches than labels, each patch gets a label of its own.
         let labels = input
             .shapes
@@ -232,7 +242,49 @@ pub fn discover(
             value: 0.0,
             current_value: f64::NEG_INFINITY,
         }
-    })
+    });
+    let area = |shape: usize, face: u32| input.shapes[shape].surface.area[face as usize];
+    input.links.repair(&mut found.labels, found.n_labels, area);
+    found
+}
+
+/// Returns the number of labels that the demands need at least.
+fn fewest_labels(links: &Links) -> usize {
+    // Each group can have a label of its own.
+    links.fewest_classes(links.groups.len()).unwrap_or(1)
+}
+
+/// Returns the demands on patches that follow from those on faces. A patch is linked if most of its
+/// area is; of a group without such a patch on a shape, the patch with most of its area.
+fn on_patches(input: &DiscoveryInput<'_>, offsets: &[usize]) -> Links {
+    let mut taken = BTreeSet::new();
+    let mut of_group = |group: &LinkedFaces| {
+        let mut area = BTreeMap::<usize, BTreeMap<usize, f64>>::new();
+        for &(shape, face) in &group.faces {
+            let s = &input.shapes[shape];
+            let patch = s.patches.patch_of_face[face as usize] as usize;
+            let of_shape = area.entry(shape).or_default();
+            *of_shape.entry(patch).or_default() += s.surface.area[face as usize];
+        }
+        let mut faces = Vec::new();
+        for (shape, linked) in area {
+            let share = |p: &usize| linked[p] / input.shapes[shape].patches.area[*p].max(1e-300);
+            let mut patches: Vec<usize> = linked.keys().copied().collect();
+            patches.sort_by(|a, b| share(b).total_cmp(&share(a)).then(a.cmp(b)));
+            let n = patches.iter().filter(|p| share(p) > 0.5).count().max(1);
+            let global = patches[..n.min(patches.len())].iter();
+            let global = global.map(|p| (offsets[shape] + p) as u32);
+            faces.extend(global.filter(|p| taken.insert(*p)).map(|p| (0, p)));
+        }
+        LinkedFaces {
+            faces,
+            class: group.class,
+        }
+    };
+    Links {
+        groups: input.links.groups.iter().map(&mut of_group).collect(),
+        apart: input.links.apart.clone(),
+    }
 }
 
 /// Returns the number of labels whose best candidate has the highest value, and the candidates.
@@ -246,7 +298,8 @@ fn estimate(
         let judge = Judge::new(criterion, candidates, &shapes.area, k);
         (judge.comparable_value(), (k, judge.into_candidates()))
     };
-    let counts = (2..=options.max_labels.max(2)).into_par_iter();
+    let fewest = fewest_labels(&shapes.input.links).max(2);
+    let counts = (fewest..=options.max_labels.max(fewest)).into_par_iter();
     let valued: Vec<(f64, (usize, Vec<Vec<u32>>))> = counts.map(valued).collect();
     let best = valued
         .into_iter()
@@ -294,6 +347,7 @@ impl<'a> Candidates<'a> {
                     .map(|(s, features)| ShapeInput { features, ..*s })
                     .collect(),
                 up_known: shapes.up_known,
+                links: shapes.input.links.clone(),
             };
             let in_metric = Prepared {
                 learned_metric: true,
@@ -361,12 +415,16 @@ pub(super) fn refine(
         }
         let classifier = statistics.classifier();
         let mut changed = 0.0;
-        let cuts: Vec<Vec<u32>> = (input.shapes.par_iter())
-            .map(|s| {
-                let log = classifier.log_probabilities(s.features).into_iter();
-                let unary: Vec<f64> = log.map(|p| (-p).min(CAP_NATS)).collect();
-                cut(s.surface, &unary, k, STRENGTH, None)
-            })
+        let unary = |s: &ShapeInput<'_>| -> Vec<f64> {
+            let log = classifier.log_probabilities(s.features).into_iter();
+            log.map(|p| (-p).min(CAP_NATS)).collect()
+        };
+        let surfaces: Vec<&Surface> = input.shapes.iter().map(|s| s.surface).collect();
+        let fixed = input
+            .links
+            .decided(&surfaces, k, |at| unary(&input.shapes[at]));
+        let cuts: Vec<Vec<u32>> = (input.shapes.par_iter().zip(&fixed))
+            .map(|(s, fixed)| cut(s.surface, &unary(s), k, STRENGTH, fixed.as_deref()))
             .collect();
         for ((s, labels), next) in input.shapes.iter().zip(&mut labels).zip(cuts) {
             let moved = (0..next.len()).filter(|&f| next[f] != labels[f]);

@@ -3,7 +3,8 @@
 //! [`discover`] finds parts that recur over a few shapes while nothing is labelled. [`LabelModel`]
 //! classifies faces by the labels of a collection. [`PriorLabels`] translates the labels that were
 //! discovered before a person labelled anything. [`cut`] turns per-face evidence into a labelling
-//! with short boundaries along concave creases.
+//! with short boundaries along concave creases. [`Links`] are demands of a person that every
+//! labelling meets.
 
 mod baselines;
 mod boundary;
@@ -14,6 +15,7 @@ mod discover;
 mod features;
 mod joint;
 mod judge;
+mod links;
 mod model;
 mod patchwise;
 mod prior;
@@ -27,6 +29,7 @@ pub use baselines::{Baseline, baseline};
 pub use boundary::refine_boundary;
 pub use discover::{Discovery, DiscoveryInput, DiscoveryOptions, ShapeInput, discover};
 pub use features::{Features, Normalisation};
+pub use links::{LinkedFaces, Links};
 pub use model::{Classifier, LabelModel, Statistics};
 pub use prior::{Overlap, Pinned, PriorLabels};
 pub use propose::{

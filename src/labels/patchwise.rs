@@ -10,6 +10,7 @@
 use super::Features;
 use super::cut::cut;
 use super::discover::Prepared;
+use super::links::Links;
 use crate::segmentation::{PatchGraph, Surface, SurfaceEdge};
 use nalgebra::{Cholesky, DMatrix};
 use std::collections::BTreeMap;
@@ -35,6 +36,7 @@ pub(super) struct Patchwise<'a> {
     /// Area-weighted sum of outer products `(dim, dim)`.
     moment: DMatrix<f64>,
     surfaces: Vec<Surface>,
+    links: &'a Links,
 }
 
 impl<'a> Patchwise<'a> {
@@ -51,6 +53,7 @@ impl<'a> Patchwise<'a> {
             means,
             area: &shapes.area,
             offsets: &shapes.offsets,
+            links: &shapes.links,
             surfaces: shapes
                 .each()
                 .map(|s| coarse(s.surface, s.patches))
@@ -94,16 +97,18 @@ impl<'a> Patchwise<'a> {
                 })
                 .collect();
             let scores = self.means.tr_mul(&weights);
+            let evidence = |p: usize| -> Vec<f64> {
+                let row: Vec<f64> = (0..k).map(|l| scores[(p, l)] + bias[l]).collect();
+                let top = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+                let log_sum = row.iter().map(|s| (s - top).exp()).sum::<f64>().ln() + top;
+                row.iter().map(|s| (log_sum - s).min(CAP_NATS)).collect()
+            };
+            let fixed = self.decided(&evidence, k);
             let mut next = Vec::with_capacity(labels.len());
             for (surface, range) in self.surfaces.iter().zip(self.offsets.windows(2)) {
-                let mut unary = Vec::with_capacity((range[1] - range[0]) * k);
-                for p in range[0]..range[1] {
-                    let row: Vec<f64> = (0..k).map(|l| scores[(p, l)] + bias[l]).collect();
-                    let top = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-                    let log_sum = row.iter().map(|s| (s - top).exp()).sum::<f64>().ln() + top;
-                    unary.extend(row.iter().map(|s| (log_sum - s).min(CAP_NATS)));
-                }
-                next.extend(cut(surface, &unary, k, STRENGTH, None));
+                let unary: Vec<f64> = (range[0]..range[1]).flat_map(evidence).collect();
+                let fixed = fixed.as_ref().map(|f| &f[range[0]..range[1]]);
+                next.extend(cut(surface, &unary, k, STRENGTH, fixed));
             }
             let settled = next == labels;
             labels = next;
@@ -113,6 +118,18 @@ impl<'a> Patchwise<'a> {
         }
         let lost = (0..k as u32).any(|l| !labels.contains(&l));
         if lost { given.to_vec() } else { labels }
+    }
+
+    /// Returns the class of each patch that demands decide; `None` if nothing is demanded.
+    fn decided(&self, evidence: &dyn Fn(usize) -> Vec<f64>, k: usize) -> Option<Vec<Option<u32>>> {
+        if self.links.is_empty() {
+            return None;
+        }
+        let costs = self.links.costs(k, |_, patch, class| {
+            self.area[patch as usize] * evidence(patch as usize)[class]
+        });
+        let classes = self.links.classes(&costs, k);
+        self.links.fixed(&classes, &[self.area.len()]).pop()
     }
 
     /// Returns the metric in which the labels of some labellings have isotropic scatter on average:

@@ -337,6 +337,7 @@ mod tests {
         let none = DiscoveryInput {
             shapes: Vec::new(),
             up_known: false,
+            links: Links::default(),
         };
         assert!(candidates(&none, 2, 1).is_empty());
         assert!(propose(&none, &[]).is_empty());

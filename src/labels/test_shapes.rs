@@ -1,7 +1,7 @@
 //! Test shapes with known parts: strips of faces, whose parts differ in descriptors and meet at
 //! creases.
 
-use super::{DiscoveryInput, Features, ShapeInput};
+use super::{DiscoveryInput, Features, Links, ShapeInput};
 use crate::segmentation::{PatchGraph, Surface, SurfaceEdge};
 use rand::{Rng, SeedableRng};
 
@@ -73,6 +73,7 @@ impl Strips {
         DiscoveryInput {
             shapes: shapes.collect(),
             up_known: false,
+            links: Links::default(),
         }
     }
 

@@ -1,11 +1,12 @@
 //! The state of a collection before a change by a person, as the catalog stores it to undo the
 //! change.
 
+use super::change::LinkEdit;
 use super::collection::{Collection, ModelState, State, StoredState};
 use super::error::Result;
 use super::rows::{damaged, from_json, to_json};
 use super::types::LabelId;
-use crate::store::{CorrectionRow, LabelRow, Reader, ReviewRow, ShapeId};
+use crate::store::{CorrectionRow, LabelRow, LinkEnd, LinkRow, Reader, ReviewRow, ShapeId};
 use serde::{Deserialize, Serialize};
 
 /// A collection as it was before a change by a person.
@@ -17,6 +18,9 @@ pub(super) struct Before {
     /// The up axis, if the change concerns it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) up: Option<String>,
+    /// The links, if the change concerns them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    links: Option<Vec<StoredLink>>,
     /// The bytes of the model; empty without a model.
     #[serde(skip)]
     model: Vec<u8>,
@@ -28,6 +32,23 @@ struct StoredLabel {
     name: Option<String>,
     colour: [u8; 3],
     merged_into: Option<u32>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct StoredLink {
+    id: i64,
+    kind: String,
+    ends: [StoredEnd; 2],
+    person: String,
+    unix_ms: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct StoredEnd {
+    shape: i64,
+    part: u32,
+    /// The first polygon of each run of polygons, and the one after its last.
+    runs: Vec<[u32; 2]>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -59,6 +80,7 @@ impl Before {
             labels: labels.into_iter().map(StoredLabel::from).collect(),
             rest: None,
             up: None,
+            links: None,
             model: Vec::new(),
         }
     }
@@ -67,6 +89,15 @@ impl Before {
     pub(super) fn up(reader: &Reader<'_>, collection: &Collection) -> Result<Self> {
         Ok(Self {
             up: Some(collection.row().up.clone()),
+            ..Self::labels(reader, collection, &[])?
+        })
+    }
+
+    /// The state before a change of links between parts.
+    pub(super) fn links(reader: &Reader<'_>, collection: &Collection) -> Result<Self> {
+        let links = reader.links(collection.id())?;
+        Ok(Self {
+            links: Some(links.into_iter().map(StoredLink::from).collect()),
             ..Self::labels(reader, collection, &[])?
         })
     }
@@ -125,6 +156,26 @@ impl Before {
         found.cloned().map(LabelRow::from)
     }
 
+    /// Returns the edits that bring the links back, from those that are there. Links of shapes that
+    /// are not there any more, by `is_there`, stay away.
+    pub(super) fn link_edits(
+        &self,
+        now: &[LinkRow],
+        is_there: &dyn Fn(ShapeId) -> bool,
+    ) -> Vec<LinkEdit> {
+        let Some(before) = &self.links else {
+            return Vec::new();
+        };
+        let newer = now.iter().filter(|l| before.iter().all(|b| b.id != l.id));
+        let mut edits: Vec<LinkEdit> = newer.map(|l| LinkEdit::TakenBack { id: l.id }).collect();
+        let gone = before.iter().filter(|b| now.iter().all(|l| l.id != b.id));
+        let gone = gone.filter(|b| b.ends.iter().all(|e| is_there(ShapeId(e.shape))));
+        edits.extend(gone.map(|b| LinkEdit::Restored {
+            row: b.clone().into(),
+        }));
+        edits
+    }
+
     /// Returns the model; `None` if there was none.
     pub(super) fn model(&self) -> Result<Option<ModelState>> {
         if self.model.is_empty() {
@@ -140,6 +191,50 @@ impl Rest {
     pub(super) fn state(&self) -> State {
         self.state.clone().into()
     }
+}
+
+impl From<LinkRow> for StoredLink {
+    fn from(row: LinkRow) -> Self {
+        Self {
+            id: row.id,
+            kind: row.kind,
+            ends: row.ends.map(|end| StoredEnd {
+                shape: end.shape.0,
+                part: end.part,
+                runs: runs(&end.polygons),
+            }),
+            person: row.person,
+            unix_ms: row.unix_ms,
+        }
+    }
+}
+
+impl From<StoredLink> for LinkRow {
+    fn from(stored: StoredLink) -> Self {
+        Self {
+            id: stored.id,
+            kind: stored.kind,
+            ends: stored.ends.map(|end| LinkEnd {
+                shape: ShapeId(end.shape),
+                part: end.part,
+                polygons: end.runs.iter().flat_map(|[from, to]| *from..*to).collect(),
+            }),
+            person: stored.person,
+            unix_ms: stored.unix_ms,
+        }
+    }
+}
+
+/// Returns the runs of consecutive numbers: the first of each, and the one after its last.
+fn runs(ascending: &[u32]) -> Vec<[u32; 2]> {
+    let mut runs: Vec<[u32; 2]> = Vec::new();
+    for at in ascending {
+        match runs.last_mut() {
+            Some(run) if run[1] == *at => run[1] += 1,
+            _ => runs.push([*at, at + 1]),
+        }
+    }
+    runs
 }
 
 impl From<ReviewRow> for StoredReview {
@@ -211,8 +306,20 @@ mod tests {
                 }),
             )],
         };
+        let link = LinkRow {
+            id: 4,
+            kind: "differ".into(),
+            ends: [vec![1, 2, 3, 9], vec![]].map(|polygons| LinkEnd {
+                shape: ShapeId(5),
+                part: 1,
+                polygons,
+            }),
+            person: "ada".into(),
+            unix_ms: 12,
+        };
         let before = Before {
             rest: Some(rest),
+            links: Some(vec![link.clone().into()]),
             model: vec![1, 2, 3],
             ..Before::names(vec![label])
         };
@@ -222,7 +329,19 @@ mod tests {
             detail_json: "{}".into(),
             before: before.encode(),
         };
-        assert_eq!(Before::decode(&row).expect("decodes"), before);
+        let decoded = Before::decode(&row).expect("decodes");
+        assert_eq!(decoded, before);
+        let newer = LinkRow {
+            id: 6,
+            ..link.clone()
+        };
+        let edits = |is_there: bool| decoded.link_edits(&[newer.clone()], &|_| is_there);
+        let text = format!("{:?}", edits(true));
+        assert_eq!(
+            text,
+            format!("[TakenBack {{ id: 6 }}, Restored {{ row: {link:?} }}]")
+        );
+        assert_eq!(format!("{:?}", edits(false)), "[TakenBack { id: 6 }]");
         row.before.truncate(20);
         assert!(Before::decode(&row).is_err());
     }

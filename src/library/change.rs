@@ -3,10 +3,12 @@
 //! and then applies it to the collection in memory.
 
 mod edits;
+mod links;
 mod log;
 mod undoable;
 
 pub(super) use edits::LabelEdit;
+pub(super) use links::LinkEdit;
 pub(super) use log::event;
 pub(super) use undoable::Undoable;
 
@@ -41,6 +43,8 @@ pub(super) struct Change {
     pub(super) up: Option<String>,
     /// The event before those of labels.
     pub(super) opening: Option<EventKind>,
+    /// Edits of links between parts.
+    pub(super) links: Vec<LinkEdit>,
     /// Edits of labels of the collection.
     pub(super) labels: Vec<LabelEdit>,
     /// New pins of shapes; `None`: no face is pinned.
@@ -163,6 +167,7 @@ impl Change {
             let before = match undoable {
                 Undoable::Name => Before::names(tx.labels(id)?),
                 Undoable::Up { .. } => Before::up(tx, collection)?,
+                Undoable::Link { .. } | Undoable::Unlink { .. } => Before::links(tx, collection)?,
                 _ => Before::labels(tx, collection, &touched)?,
             };
             tx.insert_correction(id, undoable.kind(), &undoable.detail(), &before.encode())?;
@@ -182,6 +187,9 @@ impl Change {
         }
         if let Some(opening) = &self.opening {
             event(tx, id, opening)?;
+        }
+        for edit in &self.links {
+            edit.write(tx, id)?;
         }
         for edit in &self.labels {
             edit.write(tx, id)?;

@@ -14,6 +14,7 @@ use super::sources::Sources;
 use super::types::{
     CollectionInfo, CollectionSpec, LabelId, LabelInfo, RequestKey, Up, UpEstimate,
 };
+use super::verdict::ReviewState;
 use crate::pipeline::Params;
 use crate::store::{CollectionId, CollectionRow, LabelRow, NewCollection, Reader, Tx};
 use std::collections::BTreeMap;
@@ -222,6 +223,23 @@ impl LabelUses {
     }
 }
 
+/// Counts the shapes of a collection by verdict.
+fn review_counts(reader: &Reader<'_>, id: CollectionId) -> Result<[(ReviewState, u64); 4]> {
+    let mut counts = ReviewState::ALL.map(|state| (state, 0));
+    let mut n_unseen = reader.n_shapes(id)?;
+    for (state, n) in &mut counts {
+        let n_given = reader.n_reviews(id, state.name())?;
+        let n_implied = match state {
+            ReviewState::Corrected => reader.n_pinned_without_review(id)?,
+            _ => 0,
+        };
+        *n = n_given + n_implied;
+        n_unseen = n_unseen.saturating_sub(*n);
+    }
+    counts[0].1 += n_unseen;
+    Ok(counts)
+}
+
 fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
     let location = format!("collections {}", row.name);
     let labels = reader.labels(row.id)?.into_iter();
@@ -240,6 +258,7 @@ fn info(reader: &Reader<'_>, row: CollectionRow) -> Result<CollectionInfo> {
             })
         }),
         n_undoable: reader.n_corrections(row.id)?,
+        reviews: review_counts(reader, row.id)?,
         sequence: row.sequence,
         n_shapes: uses.n_shapes,
         n_stale: reader.n_stale(row.id)?,

@@ -353,18 +353,8 @@ fn polygon_labels(
         }
         Correction::Part { part, label } => {
             let label = in_range(*label)?;
-            let ids = face_ids(&known.labels.proxy_labels);
-            let pieces = parts(&Surface::new(&view.mesh()), &ids);
-            let Some(id) = pieces.label.get(*part as usize) else {
-                let n = pieces.label.len();
-                let message = format!("part {part} is named, but shape {name:?} has {n}");
-                return Err(LibraryError::invalid(Reason::PartIndex, message));
-            };
-            for (p, slot) in given.iter_mut().enumerate() {
-                let is_in = pieces.part_of_face[view.face_map[p] as usize] == *part;
-                if is_in && known.labels.polygon_labels[p] == *id as i32 {
-                    *slot = label;
-                }
+            for polygon in part_polygons(known, view, *part)? {
+                given[polygon as usize] = label;
             }
         }
     }
@@ -374,6 +364,27 @@ fn polygon_labels(
         return Err(LibraryError::invalid(Reason::NothingCorrected, message));
     }
     Ok(given)
+}
+
+/// Returns the polygons of a part, ascending.
+pub(super) fn part_polygons(
+    known: &Known,
+    view: &DescriptionView<'_>,
+    part: u32,
+) -> Result<Vec<u32>> {
+    let ids = face_ids(&known.labels.proxy_labels);
+    let pieces = parts(&Surface::new(&view.mesh()), &ids);
+    let Some(id) = pieces.label.get(part as usize) else {
+        let (name, n) = (&known.row.name, pieces.label.len());
+        let message = format!("part {part} is named, but shape {name:?} has {n}");
+        return Err(LibraryError::invalid(Reason::PartIndex, message));
+    };
+    let is_in = |polygon: &u32| {
+        let p = *polygon as usize;
+        let part_of = pieces.part_of_face[view.face_map[p] as usize];
+        part_of == part && known.labels.polygon_labels[p] == *id as i32
+    };
+    Ok((0..view.face_map.len() as u32).filter(is_in).collect())
 }
 
 /// Returns the newest labels of a shape, overwritten by those that a person gave.

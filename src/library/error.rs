@@ -49,6 +49,7 @@ pub enum Named {
     Job,
     JobItem,
     Version,
+    Link,
 }
 
 impl std::fmt::Display for Named {
@@ -60,6 +61,7 @@ impl std::fmt::Display for Named {
             Self::Job => "job",
             Self::JobItem => "job item",
             Self::Version => "version",
+            Self::Link => "link",
         })
     }
 }
@@ -77,6 +79,7 @@ impl From<&LibraryError> for Failure {
                     Named::Label => Reason::NoLabel,
                     Named::Job => Reason::NoJob,
                     Named::Version => Reason::NoVersion,
+                    Named::Link => Reason::NoLink,
                     Named::JobItem => Reason::Unspecified,
                 },
             ),

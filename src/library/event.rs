@@ -1,5 +1,6 @@
 //! The events of a collection, as they are logged and published.
 
+use super::linked::{LinkKind, PartName};
 use super::types::LabelId;
 use serde::{Deserialize, Serialize};
 
@@ -108,6 +109,20 @@ pub enum EventKind {
         /// Its value; see docs/methods.md.
         value: f64,
     },
+    /// A person linked two parts: they must have the same label, or different ones.
+    PartsLinked {
+        /// Id of the link.
+        link: u64,
+        /// What it demands.
+        kind: LinkKind,
+        /// The parts.
+        parts: [PartName; 2],
+    },
+    /// A person removed a link between two parts.
+    PartsUnlinked {
+        /// Id of the link.
+        link: u64,
+    },
     /// The parts of the collection were clustered again.
     Reclustered {
         /// Score of the old labelling; see docs/methods.md.
@@ -137,6 +152,8 @@ impl EventKind {
             Self::Undone { .. } => "undone",
             Self::UpChanged { .. } => "up_changed",
             Self::Chosen { .. } => "chosen",
+            Self::PartsLinked { .. } => "parts_linked",
+            Self::PartsUnlinked { .. } => "parts_unlinked",
             Self::Reclustered { .. } => "reclustered",
         }
     }

@@ -19,10 +19,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Undone {
     /// The kind of change: `correct`, `answer`, `approve`, `doubt`, `name`, `merge`, `split`,
-    /// `up` or `choose`.
+    /// `up`, `choose`, `same`, `differ` or `unlink`.
     pub change: String,
-    /// What the change concerned: a shape, a label, an axis or a proposal; empty in a reply that
-    /// an earlier version stored.
+    /// What the change concerned: a shape, a label, an axis, a proposal or two parts; empty in a
+    /// reply that an earlier version stored.
     #[serde(default)]
     pub subject: String,
     /// Number of changes by persons that can still be undone.
@@ -33,8 +33,8 @@ pub struct Undone {
 
 impl Library {
     /// Undoes the newest change that a person made to a collection: a correction, a name, a merge,
-    /// a split, another up axis or the choice of a proposal. Shapes get the labels back that they
-    /// had before it; shapes that were added since are relabelled. Can be repeated, back to the
+    /// a split, another up axis, the choice of a proposal or a link. Shapes get the labels back that
+    /// they had before it; shapes that were added since are relabelled. Can be repeated, back to the
     /// first change. Cannot itself be undone.
     ///
     /// # Errors
@@ -76,7 +76,7 @@ impl Library {
 /// Returns the subject of a change from its stored details.
 fn subject(detail: &str) -> String {
     let detail: serde_json::Value = serde_json::from_str(detail).unwrap_or_default();
-    let found = ["shape", "label", "from", "proposal"]
+    let found = ["shape", "label", "from", "proposal", "parts"]
         .iter()
         .find_map(|key| detail.get(key));
     match found {
@@ -109,6 +109,8 @@ fn undoing(
             None => LabelEdit::Retired(label.id),
         });
     }
+    let is_there = |shape: ShapeId| collection.position(shape).is_some();
+    change.links = before.link_edits(&sources.links(collection.id())?, &is_there);
     let Some(rest) = &before.rest else {
         return Ok(change);
     };

@@ -53,6 +53,7 @@ impl Library {
             let labels = self.store.labels(id)?;
             require_in_use(&labels, label)?;
             require_in_use(&labels, into)?;
+            self.check_merge(collection, (label, into))?;
             let catalog = self.store.catalog();
             let labelled = catalog.read(|r| r.shapes(id, 0, usize::MAX, Some(label)))?;
             let labelled: Vec<ShapeId> = labelled.into_iter().map(|s| s.id).collect();
@@ -183,7 +184,7 @@ fn split(collection: &Collection, sources: &dyn Sources, label: LabelId) -> Resu
     let mut kept = supervision.map_or_else(Vec::new, |s| s.discovered().kept.clone());
     // Training shapes show every label, unless discovered ones may be on other shapes alone.
     let on_training = supervision.is_some_and(|s| !s.is_open()) && kept.is_empty();
-    let members = fit::members(collection);
+    let members = fit::members(collection, &sources.links(collection.id())?);
     let chosen: Vec<usize> = (0..shapes.len())
         .filter(|at| shapes[*at].pinned || !on_training && members.contains(at))
         .collect();

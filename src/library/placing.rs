@@ -3,7 +3,7 @@
 use super::advance::{fit_model, relabel_all};
 use super::agreement::n_inconsistent;
 use super::change::{Addition, Change, LabelEdit, commit};
-use super::collection::discovered::{self, MAX_REPRESENTATIVES, NewShape, Plan};
+use super::collection::discovered::{self, NewShape, Plan};
 use super::collection::{Collection, supervised};
 use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
@@ -12,7 +12,7 @@ use super::lookup::object_length;
 use super::reason::{Code, Reason};
 use super::refusal::failure;
 use super::rows::{report_to_json, to_json};
-use super::sources::FileView;
+use super::sources::{FileView, Sources};
 use super::submit::{Described, read_by_first_release};
 use super::types::{Failure, ItemState, JobItem, NewShape as ShapeToAdd, Outcome, Placed};
 use super::voting::Voted;
@@ -276,7 +276,8 @@ fn plan(
         }
         (labelling, _) => {
             if labelling.is_none() || discovered::is_due(collection) {
-                let chosen = collection.representatives(MAX_REPRESENTATIVES);
+                let links = store.links(collection.id())?;
+                let chosen = discovered::representatives(collection, &links);
                 relabel_all(store, collection, &chosen)?;
             }
             discovered::plan(collection, store, new, labelling)?

@@ -12,7 +12,7 @@ use super::pins::pins_of;
 use super::reason::Reason;
 use super::review_rows::{check_reviewer, review_row};
 use super::rows::{label_colour, to_json};
-use super::sources::Sources;
+use super::sources::{Known, Sources};
 use super::types::{LabelId, RequestKey};
 use super::verdict::ReviewState;
 use crate::description::DescriptionView;
@@ -72,7 +72,8 @@ pub struct OfferedLabel {
 pub enum Answer {
     /// The part has this label.
     Label(LabelId),
-    /// The part has the label of this name, which is created if no label is named so.
+    /// The part has the label of this name. If no label is named so, the discovered label of most of
+    /// the part gets the name, or a new label if a person has used or named that one.
     Named(String),
     /// The person passes the question over.
     Skip,
@@ -230,17 +231,15 @@ impl Library {
                 let message = format!("part {part} is named, but shape {shape:?} has {n}");
                 return Err(LibraryError::invalid(Reason::PartIndex, message));
             }
+            let faces = faces_of(&known.view(), &parts, part);
             let (label, new) = match answer {
                 Answer::Label(label) => (*label, None),
-                Answer::Named(name) => self.label_of_name(in_memory, name)?,
+                Answer::Named(name) => self.label_of_name(in_memory, name, (&known, &faces))?,
                 Answer::Skip | Answer::CutWrongly => {
                     return self.pass(in_memory, id, part, &text, &request);
                 }
             };
-            let correction = Correction::Faces {
-                faces: faces_of(&known.view(), &parts, part),
-                label,
-            };
+            let correction = Correction::Faces { faces, label };
             let mut corrects = corrects(in_memory, &self.store, id, &correction, None)?;
             let change = &mut corrects.change;
             change.undoable = Some(Undoable::Answer {
@@ -283,16 +282,31 @@ impl Library {
         Ok(passed)
     }
 
-    /// Returns the label of a name, and the edit that creates it if there is none.
+    /// Returns the label of a name, and the edit that gives the name to a label if none has it: to
+    /// the discovered label that the faces have, unless a person used or named it, or else to a new
+    /// label. So a name holds at once wherever discovery found the same part.
     fn label_of_name(
         &self,
         collection: &Collection,
         name: &str,
+        (known, faces): (&Known, &[u32]),
     ) -> Result<(LabelId, Option<LabelEdit>)> {
         let labels = self.store.labels(collection.id())?;
         let is_named = |l: &&LabelRow| l.merged_into.is_none() && l.name.as_deref() == Some(name);
         if let Some(row) = labels.iter().find(is_named) {
             return Ok((row.id, None));
+        }
+        let pins = pins(collection, &self.store)?;
+        let discovered = found(collection).map_or(&[][..], |f| f.labels);
+        let is_free = |row: &&LabelRow| {
+            let id = i64::from(row.id);
+            let is_used = pins.values().flatten().any(|p| i64::from(*p) == id);
+            row.name.is_none() && row.merged_into.is_none() && !is_used
+        };
+        let own = label_of_most(known, faces).filter(|label| discovered.contains(label));
+        let own = own.and_then(|label| labels.iter().find(|l| l.id == label));
+        if let Some(row) = own.filter(is_free) {
+            return Ok((row.id, Some(LabelEdit::Named(row.clone(), name.to_owned()))));
         }
         let id = collection.row().next_label;
         let row = LabelRow {
@@ -361,6 +375,19 @@ impl Library {
             })
             .collect()
     }
+}
+
+/// Returns the label that more than half of the area of some polygons has.
+fn label_of_most(known: &Known, faces: &[u32]) -> Option<LabelId> {
+    let view = known.view();
+    let mut area = BTreeMap::<i32, f64>::new();
+    for face in faces {
+        let label = known.labels.polygon_labels[*face as usize];
+        *area.entry(label).or_default() += f64::from(view.polygon_area[*face as usize]);
+    }
+    let total: f64 = area.values().sum();
+    let most = area.into_iter().find(|(_, a)| 2.0 * a > total)?;
+    LabelId::try_from(most.0).ok()
 }
 
 /// Returns the up axis along which descriptors are taken.

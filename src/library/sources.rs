@@ -7,8 +7,8 @@ use crate::labels::LabelModel;
 use crate::pipeline::Prepared;
 use crate::segmentation::Surface;
 use crate::store::{
-    CollectionId, Digest, LabelRow, LabelVersionRow, MapRow, MappedDescription, ObjectKind,
-    ObjectRow, Reader, ShapeId, ShapeRow, Store,
+    CollectionId, Digest, LabelRow, LabelVersionRow, LinkRow, MapRow, MappedDescription,
+    ObjectKind, ObjectRow, Reader, ShapeId, ShapeRow, Store,
 };
 use std::sync::Arc;
 
@@ -94,6 +94,8 @@ pub(super) trait Sources: Sync {
     fn maps_into(&self, to: ShapeId) -> Result<Vec<MapRow>>;
     /// The labels of a collection.
     fn labels(&self, collection: CollectionId) -> Result<Vec<LabelRow>>;
+    /// The links between parts of a collection, the oldest first.
+    fn links(&self, collection: CollectionId) -> Result<Vec<LinkRow>>;
     /// The bytes of a mesh file by their digest.
     fn original(&self, digest: &Digest) -> Result<Vec<u8>>;
 }
@@ -148,6 +150,10 @@ impl Sources for Store {
 
     fn labels(&self, collection: CollectionId) -> Result<Vec<LabelRow>> {
         Ok(self.catalog().read(|r| r.labels(collection))?)
+    }
+
+    fn links(&self, collection: CollectionId) -> Result<Vec<LinkRow>> {
+        Ok(self.catalog().read(|r| r.links(collection))?)
     }
 
     fn original(&self, digest: &Digest) -> Result<Vec<u8>> {

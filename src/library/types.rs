@@ -1,7 +1,7 @@
 //! The values that the library takes and returns: collections, shapes, labels, jobs, events.
 
 use super::reason::{Code, Reason};
-use super::verdict::Review;
+use super::verdict::{Review, ReviewState};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
 use serde::{Deserialize, Serialize};
@@ -114,6 +114,8 @@ pub struct CollectionInfo {
     pub up_disagrees: Option<UpEstimate>,
     /// Number of changes by persons that can be undone.
     pub n_undoable: u64,
+    /// Number of its shapes with each verdict, in the order of [`ReviewState::ALL`].
+    pub reviews: [(ReviewState, u64); 4],
 }
 
 /// An estimate of the up axis.

@@ -6,7 +6,7 @@
 
 use super::advance::relabel_all;
 use super::change::{Change, Undoable, commit_once};
-use super::collection::discovered::{self, MAX_REPRESENTATIVES};
+use super::collection::discovered;
 use super::collection::up::UpFound;
 use super::collection::{Collection, Regime, Staleness, supervised};
 use super::error::Result;
@@ -70,7 +70,8 @@ impl Library {
         let change = if is_same || is_supervised {
             without_clustering(collection, &self.store, found, is_same)?
         } else {
-            let chosen = collection.representatives(MAX_REPRESENTATIVES);
+            let links = self.store.links(collection.id())?;
+            let chosen = discovered::representatives(collection, &links);
             relabel_all(&self.store, collection, &chosen)?;
             discovered::turn(collection, &self.store, up)?
         };

@@ -4,7 +4,7 @@
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
     Baseline, Candidate, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel,
-    Normalisation, Proposal, ShapeInput, Statistics, baseline, candidates, discover, propose,
+    Links, Normalisation, Proposal, ShapeInput, Statistics, baseline, candidates, discover, propose,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -32,6 +32,8 @@ pub struct ReclusterOptions {
     pub min_gain: f64,
     /// The first label id that was never used.
     pub next_label: u32,
+    /// Demands of a person that the new labels must meet.
+    pub links: Links,
 }
 
 /// A change of label ids in a re-clustering.
@@ -83,7 +85,11 @@ pub fn recluster(
     let together = Together::new(&views, options.up);
     let current = old.map(|model| current_classes(shapes, model));
     let current_input = current.as_deref().zip(old.map(|m| m.labels.len()));
-    let found = discover(&together.input(), &options.discovery, current_input);
+    let input = DiscoveryInput {
+        links: options.links.clone(),
+        ..together.input()
+    };
+    let found = discover(&input, &options.discovery, current_input);
     relabelled(&together, found, current, old, epoch, options)
 }
 
@@ -214,6 +220,7 @@ impl Together {
                 })
                 .collect(),
             up_known: self.normalisation.up_known,
+            links: Links::default(),
         }
     }
 }

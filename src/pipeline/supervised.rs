@@ -28,9 +28,10 @@ use super::place::{blended, vote_probabilities};
 use super::{DescriptionView, Labelling, Prepared, Vote};
 use crate::fmap::Confidence;
 use crate::labels::cut::{STRENGTH, cut};
-use crate::labels::{Classifier, Overlap, PriorLabels, Statistics};
+use crate::labels::{Classifier, Links, Overlap, PriorLabels, Statistics};
 use crate::segmentation::{Surface, parts};
 use rayon::iter::{IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
+use std::borrow::Cow;
 
 /// Number of parts into which a shape is divided: so many for each class, and so many more.
 const N_PARTS_A_CLASS: usize = 2;
@@ -133,6 +134,8 @@ pub struct FurtherEvidence<'a> {
     /// whole shapes since. They show what parts are like on average and how much parts of one label
     /// differ between shapes, which a few training shapes do not show.
     pub discovered: Option<&'a DiscoveredLabels>,
+    /// Demands of a person on labels of the shapes of the fit.
+    pub links: &'a Links,
 }
 
 /// Discovered labels beside a person's.
@@ -192,37 +195,34 @@ pub fn fit(
         .map(|l| parts_for(&l.shape, l.prepared, k))
         .collect();
     let mut votes: Vec<Vec<u8>> = members.iter().map(|l| first_vote(l, k)).collect();
+    let surfaces: Vec<&Surface> = members.iter().map(|l| &*l.prepared.surface).collect();
     let mut statistics = with_scatter(&certain);
     let mut labellings = Vec::new();
     for round in 0..=options.n_rounds {
         let classifier = statistics.classifier().at_temperature(options.temperature);
+        let costs = |to: usize| {
+            let into = votes_into(members, maps, &votes, to, options);
+            let evidence = Evidence {
+                classifier: &classifier,
+                votes: &into,
+                own: own[to].as_ref(),
+                part_of: &part_of[to],
+            };
+            costs(
+                &members[to].shape,
+                members[to].prepared,
+                &evidence,
+                k,
+                options,
+            )
+        };
+        let decided = further.links.decided(&surfaces, k, |to| costs(to).0);
         labellings = (0..members.len())
             .into_par_iter()
             .map(|to| {
-                let member = &members[to];
-                let into: Vec<Vote<'_>> = maps
-                    .iter()
-                    .filter(|m| m.to == to && !votes[m.from].is_empty())
-                    .map(|m| Vote {
-                        faces: members[m.from].shape.faces,
-                        probabilities: &votes[m.from],
-                        p2p: m.p2p,
-                        confidence: m.confidence,
-                        trust: if members[m.from].pinned.is_empty() {
-                            1.0
-                        } else {
-                            options.training_trust
-                        },
-                    })
-                    .collect();
-                let evidence = Evidence {
-                    classifier: &classifier,
-                    votes: &into,
-                    own: own[to].as_ref(),
-                    part_of: &part_of[to],
-                    pinned: member.pinned,
-                };
-                labelled(&member.shape, member.prepared, &evidence, k, options)
+                let (unary, weights) = costs(to);
+                let fixed = pinned_or(members[to].pinned, decided[to].as_deref());
+                labelled(members[to].prepared, (&unary, weights), &fixed, k, options)
             })
             .collect();
         if round < options.n_rounds {
@@ -256,9 +256,9 @@ pub fn label_fitted(
         votes,
         own: own.as_ref(),
         part_of: &parts_for(shape, prepared, k),
-        pinned,
     };
-    labelled(shape, prepared, &evidence, k, options)
+    let (unary, weights) = costs(shape, prepared, &evidence, k, options);
+    labelled(prepared, (&unary, weights), pinned, k, options)
 }
 
 /// Converts classes of polygons `(n_polygons,)` to classes of proxy faces `(m,)`. A face is pinned
@@ -282,6 +282,47 @@ pub fn proxy_pins(
         (pinned > row[k]).then_some(best as u32)
     };
     area.chunks_exact(k + 1).map(most).collect()
+}
+
+/// Returns the votes of the other members for one.
+fn votes_into<'a>(
+    members: &'a [FitShape<'_>],
+    maps: &'a [FitMap<'_>],
+    votes: &'a [Vec<u8>],
+    to: usize,
+    options: &FitOptions,
+) -> Vec<Vote<'a>> {
+    let into = maps
+        .iter()
+        .filter(|m| m.to == to && !votes[m.from].is_empty());
+    into.map(|m| Vote {
+        faces: members[m.from].shape.faces,
+        probabilities: &votes[m.from],
+        p2p: m.p2p,
+        confidence: m.confidence,
+        trust: if members[m.from].pinned.is_empty() {
+            1.0
+        } else {
+            options.training_trust
+        },
+    })
+    .collect()
+}
+
+/// Returns the class of each face that a person labelled, elsewhere that which links decide; empty
+/// if neither decides any.
+fn pinned_or<'a>(
+    pinned: &'a [Option<u32>],
+    decided: Option<&'a [Option<u32>]>,
+) -> Cow<'a, [Option<u32>]> {
+    match (pinned, decided) {
+        (pinned, None) => Cow::Borrowed(pinned),
+        ([], Some(decided)) => Cow::Borrowed(decided),
+        (pinned, Some(decided)) => {
+            let both = pinned.iter().zip(decided);
+            Cow::Owned(both.map(|(pin, link)| pin.or(*link)).collect())
+        }
+    }
 }
 
 /// Returns the vote of a shape in the first round: pinned classes, elsewhere the discovered labels.
@@ -371,16 +412,17 @@ struct Evidence<'a> {
     own: Option<&'a OwnVote>,
     /// Part of each face `(m,)`.
     part_of: &'a [u32],
-    pinned: &'a [Option<u32>],
 }
 
-fn labelled(
+/// Returns the cost of each class for each face `(m, k)`, and the weights of the votes of other
+/// shapes.
+fn costs(
     shape: &DescriptionView<'_>,
     prepared: &Prepared,
     evidence: &Evidence<'_>,
     k: usize,
     options: &FitOptions,
-) -> Labelling {
+) -> (Vec<f64>, Vec<f64>) {
     let log_model = evidence.classifier.log_probabilities(&prepared.features);
     let mut votes = evidence.votes.to_vec();
     votes.extend(evidence.own.map(|own| Vote {
@@ -398,11 +440,22 @@ fn labelled(
     let unary = blended(&log_model, &voted, options.vote_share, k);
     let part_of = evidence.part_of;
     let unary = shared_by_parts(unary, &prepared.surface, part_of, k, options.part_share);
-    let fixed = (!evidence.pinned.is_empty()).then_some(evidence.pinned);
-    let classes = cut(&prepared.surface, &unary, k, options.strength, fixed);
+    (unary, weights)
+}
+
+/// Labels a shape by the costs of classes. Faces with a class in `fixed` have that class.
+fn labelled(
+    prepared: &Prepared,
+    (unary, weights): (&[f64], Vec<f64>),
+    fixed: &[Option<u32>],
+    k: usize,
+    options: &FitOptions,
+) -> Labelling {
+    let pinned = (!fixed.is_empty()).then_some(fixed);
+    let classes = cut(&prepared.surface, unary, k, options.strength, pinned);
     let mut posterior: Vec<f64> = unary.iter().map(|u| (-u).exp()).collect();
     for (f, row) in posterior.chunks_exact_mut(k).enumerate() {
-        if let Some(class) = evidence.pinned.get(f).copied().flatten() {
+        if let Some(class) = fixed.get(f).copied().flatten() {
             row.fill(0.0);
             row[class as usize] = 1.0;
             continue;

@@ -50,8 +50,9 @@ pub use objects::{Kept, Objects};
 pub use prepared::PreparedShapes;
 pub use rows::{
     CandidatesRow, CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow,
-    LabelSummary, LabelVersionRow, LabelsBefore, MapRow, NewCollection, NewJobItem, NewShapeRow,
-    ObjectKind, ObjectRow, PassedPart, PointMapRow, ProposalRow, RequestRow, ReviewRow, ShapeId,
+    LabelSummary, LabelVersionRow, LabelsBefore, LinkEnd, LinkRow, MapRow, NewCollection,
+    NewJobItem, NewShapeRow, ObjectKind, ObjectRow, PassedPart, PointMapRow, ProposalRow,
+    RequestRow, ReviewRow, ShapeId,
     ShapeRow,
 };
 

@@ -280,6 +280,32 @@ pub struct PassedPart {
     pub why: String,
 }
 
+/// A part of a shape that is linked to another one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LinkEnd {
+    /// Its shape.
+    pub shape: ShapeId,
+    /// Its number when it was linked. Parts are numbered again whenever labels change.
+    pub part: u32,
+    /// Its polygons, ascending.
+    pub polygons: Vec<u32>,
+}
+
+/// A link between two parts, as a person made it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LinkRow {
+    /// Its id; ids grow in the order of the links. 0: not stored yet.
+    pub id: i64,
+    /// What it demands, as the library writes it.
+    pub kind: String,
+    /// The two parts.
+    pub ends: [LinkEnd; 2],
+    /// Who made it, as the person said; may be empty.
+    pub person: String,
+    /// When, in milliseconds since 1970.
+    pub unix_ms: u64,
+}
+
 /// The newest labels a shape had before a correction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelsBefore {

@@ -41,6 +41,7 @@ DAEMONS: dict[str, dict[str, str]] = {
     },
     "tcp": {},
     "asking": {},
+    "linking": {},
 }
 
 
@@ -141,6 +142,12 @@ def mask(reply: message_pb2.Reply) -> None:
         for shape in reply.list_shapes.shapes:
             if shape.review.unix_ms:
                 shape.review.unix_ms = 1
+    for body in ("link_parts", "unlink_parts"):
+        if reply.HasField(body):  # type: ignore[arg-type]
+            getattr(reply, body).link.unix_ms = 1
+    if reply.HasField("list_links"):
+        for link in reply.list_links.links:
+            link.unix_ms = 1
 
 
 class Recorder:
@@ -563,6 +570,31 @@ def asking(r: Recorder) -> None:
     r.say("error_nothing_to_ask", "a person labelled every part", next_question={**of, "passed": True})
 
 
+def linking(r: Recorder) -> None:
+    """A person links parts of shapes that nobody has labelled."""
+    of = {"collection": "linked"}
+    a, b = skittle(0), skittle(3)
+    two = {"n_parts": 2, "working_faces": WORKING_FACES}
+    r.say(
+        "add_shapes_linked", "two files", [a, b], **add([encoded("a"), encoded("b", 1)], "linked", create=two)
+    )
+    parts = {**of, "a": {"shape": "a", "part": 0}, "b": {"shape": "b", "part": 0}, "by": "ada"}
+    r.say("link_parts", "two parts must differ", link_parts={**parts, "kind": "LINK_KIND_DIFFER"})
+    r.settle("linked")
+    r.say("list_links", "the link, and whether it holds", list_links={**of, "shape": "b"})
+    r.say("events_since_linked", "what the link changed", events_since=of)
+    r.say("undo_link", "the link is taken back", undo=of)
+    r.say("link_parts_same", "the parts must be equal", link_parts={**parts, "kind": "LINK_KIND_SAME"})
+    r.settle("linked")
+    r.say(
+        "error_link_contradicts",
+        "they must be equal already",
+        link_parts={**parts, "kind": "LINK_KIND_DIFFER"},
+    )
+    r.say("unlink_parts", "the link is removed", unlink_parts={**of, "id": 2})
+    r.say("error_no_link", "a link that is not there", unlink_parts={**of, "id": 9})
+
+
 def small(r: Recorder) -> None:
     """A daemon with little room."""
     a = skittle(0)
@@ -593,6 +625,7 @@ def composed(r: Recorder) -> None:
         "DEADLINE": ("DEADLINE_EXCEEDED", "no answer within the request's 1 ms", {}),
         "GONE": ("NOT_FOUND", 'no collection named "things"', {}),
         "LABEL_LIMIT": ("INVALID_ARGUMENT", "the collection would have more labels than it may", {}),
+        "LINK_LIMIT": ("FAILED_PRECONDITION", "the collection has 100 links, the limit", {}),
         "LABEL_TOO_SMALL": ("FAILED_PRECONDITION", "label 3 is too small to be two", {}),
         "MESH": ("INVALID_ARGUMENT", "face 17 cannot be part of a surface", {"face": 17}),
         "LAPLACIAN": ("INVALID_ARGUMENT", "the Laplacian of the mesh cannot be built", {}),
@@ -639,7 +672,8 @@ def composed(r: Recorder) -> None:
 def main() -> None:
     """Records all of it."""
     recorder = Recorder()
-    for name, conversations in (("plain", plain), ("small", small), ("tcp", tcp), ("asking", asking)):
+    all_of_them = (plain, small, tcp, asking, linking)
+    for name, conversations in zip(DAEMONS, all_of_them, strict=True):
         recorder.daemon, recorder.daemon_name = Daemon(sys.argv[1], name), name
         try:
             conversations(recorder)

@@ -87,6 +87,47 @@ fn answers_pin_parts_and_name_labels_that_are_then_offered() {
 }
 
 #[test]
+fn a_new_name_is_that_of_the_discovered_label_unless_a_person_used_it() {
+    let shapes = family(Family::Pliers, 37, 4, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let discovered = all_labels(&library);
+    let first = ask(&library);
+    let own = |question: &PartQuestion| {
+        let of_shape = &discovered[&question.shape];
+        let mut counts = BTreeMap::<i32, usize>::new();
+        for face in &question.faces {
+            *counts.entry(of_shape[*face as usize]).or_default() += 1;
+        }
+        *counts.iter().max_by_key(|c| c.1).unwrap().0 as u32
+    };
+    let label = answer(&library, &first, &Answer::Named("one".into())).unwrap();
+    assert_eq!(label, own(&first), "most of the part has this label");
+    let named = library.collection(COLLECTION).unwrap().labels;
+    let row = named.iter().find(|l| l.id == label).unwrap();
+    assert_eq!(row.name.as_deref(), Some("one"));
+    // The other shapes have the label, and so the name, at once.
+    let has_it = |s: &&Labelled| all_labels(&library)[&s.name].contains(&(label as i32));
+    assert_eq!(shapes.iter().filter(has_it).count(), 4);
+    // Another name for a part with the same label makes a new label.
+    let second = loop {
+        let question = ask(&library);
+        if own(&question) == label {
+            break question;
+        }
+        answer(&library, &question, &Answer::Skip);
+    };
+    let other = answer(&library, &second, &Answer::Named("two".into())).unwrap();
+    assert!(!discovered.values().flatten().any(|l| *l == other as i32));
+    library.undo(COLLECTION, None).unwrap();
+    library.undo(COLLECTION, None).unwrap();
+    let labels = library.collection(COLLECTION).unwrap().labels;
+    let row = labels.iter().find(|l| l.id == label).unwrap();
+    assert_eq!(row.name, None);
+    assert_eq!(all_labels(&library), discovered);
+}
+
+#[test]
 fn the_next_question_does_not_wait_for_propagation() {
     let shapes = family(Family::Pliers, 32, 5, &SMALL);
     let (_folder, library) = library(3, Up::Unknown);

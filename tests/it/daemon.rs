@@ -8,6 +8,7 @@ mod flood;
 mod http_abuse;
 mod isolation;
 mod life;
+mod linking;
 mod overload;
 mod paths;
 mod proposing;

@@ -69,7 +69,7 @@ fn recorded_conversations_are_answered_alike() {
     let text = std::fs::read_to_string(folder().join("index.json")).unwrap();
     let index: Vec<Value> = serde_json::from_str(&text).unwrap();
     assert!(index.len() >= 40, "only {} conversations", index.len());
-    let settings: [(&str, &[(&str, &str)]); 4] = [
+    let settings: [(&str, &[(&str, &str)]); 5] = [
         ("plain", &[]),
         (
             "small",
@@ -81,6 +81,7 @@ fn recorded_conversations_are_answered_alike() {
         ),
         ("tcp", &[]),
         ("asking", &[]),
+        ("linking", &[]),
     ];
     let mut n_held = 0;
     let mut faults = Vec::new();

@@ -11,6 +11,7 @@ mod fuzzing;
 mod golden;
 mod harness;
 mod hostile;
+mod linking;
 mod maps;
 mod old_store;
 mod pipeline;

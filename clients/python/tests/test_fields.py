@@ -81,6 +81,9 @@ CALLS: dict[str, Call] = {
     "list_proposals": lambda _, c: c.proposals(),
     "get_proposal": lambda _, c: c.proposed_labels(1),
     "choose_proposal": lambda _, c: c.choose(1),
+    "link_parts": lambda _, c: c.same(("a", 0), ("b", 1)),
+    "unlink_parts": lambda _, c: c.unlink(1),
+    "list_links": lambda _, c: c.links("a"),
 }
 
 

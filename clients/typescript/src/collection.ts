@@ -7,6 +7,7 @@ import { batches, type Batch, type Item } from "./batch.js";
 import { BadReply, CosegError, EventLogRewound, NoAnswer, Refused } from "./errors.js";
 import type { CollectionSpec } from "./gen/coseg/v1/collection_pb.js";
 import { EventSchema } from "./gen/coseg/v1/event_pb.js";
+import { LinkKind } from "./gen/coseg/v1/link_pb.js";
 import { PortraitDetail } from "./gen/coseg/v1/portrait_pb.js";
 import { ReviewState } from "./gen/coseg/v1/review_pb.js";
 import { PACE_MS, WAIT_MS, type Library } from "./library.js";
@@ -16,6 +17,7 @@ import {
   failed,
   functionalMap,
   job,
+  link,
   mapQuality,
   pointOptions,
   present,
@@ -38,9 +40,12 @@ import type {
   Job,
   Label,
   Labelling,
+  Link,
+  Linked,
   MapOptions,
   Neighbor,
   PartMatches,
+  PartOfShape,
   Points,
   Proposals,
   Rows,
@@ -469,7 +474,7 @@ export class Collection {
     return found[0]!;
   }
 
-  /** Undoes the newest correction, name, merge, split, change of the up axis or choice. */
+  /** Undoes the newest correction, name, merge, split, link, change of the up axis or choice. */
   async undo(): Promise<Undone> {
     return plain((await this.library.call("undo", { collection: this.name }))[0]);
   }
@@ -534,6 +539,34 @@ export class Collection {
   async choose(n: number, options: { set?: string } = {}): Promise<Chosen> {
     const request = { collection: this.name, n, set: options.set ?? "" };
     return plain((await this.library.call("chooseProposal", request))[0]);
+  }
+
+  /** Demands that two parts have the same label. */
+  async same(a: PartOfShape, b: PartOfShape, options: { by?: string } = {}): Promise<Linked> {
+    return this.#link(LinkKind.SAME, a, b, options);
+  }
+
+  /** Demands that two parts have different labels. */
+  async differ(a: PartOfShape, b: PartOfShape, options: { by?: string } = {}): Promise<Linked> {
+    return this.#link(LinkKind.DIFFER, a, b, options);
+  }
+
+  async #link(kind: LinkKind, a: PartOfShape, b: PartOfShape, options: { by?: string }): Promise<Linked> {
+    const request = { collection: this.name, kind, a: { ...a }, b: { ...b }, by: options.by ?? "" };
+    const [reply] = await this.library.call("linkParts", request);
+    return { ...plain(reply), link: link(reply.link), jobId: reply.jobId };
+  }
+
+  /** Removes the link with this id. */
+  async unlink(id: number): Promise<Linked> {
+    const [reply] = await this.library.call("unlinkParts", { collection: this.name, id: BigInt(id) });
+    return { ...plain(reply), link: link(reply.link), changed: true, jobId: reply.jobId };
+  }
+
+  /** Links between parts, the oldest first; with `shape` only those of its parts. */
+  async links(shape = ""): Promise<Link[]> {
+    const [reply] = await this.library.call("listLinks", { collection: this.name, shape });
+    return reply.links.map(link);
   }
 
   /** The shape that is most worth labelling by hand, or undefined if there is none. */

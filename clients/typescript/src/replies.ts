@@ -4,8 +4,9 @@ import { create } from "@bufbuild/protobuf";
 import { BadReply, CosegError, refused } from "./errors.js";
 import { MapOrientation, Resolution as WireResolution, type GetFunctionalMapReply, type MapQuality as WireMapQuality } from "./gen/coseg/v1/analysis_pb.js";
 import { CollectionSpecSchema, Operator, Up, type CollectionSpec, type LabelInfo } from "./gen/coseg/v1/collection_pb.js";
+import { LinkKind, type Link as WireLink } from "./gen/coseg/v1/link_pb.js";
 import { ItemState, Outcome, type Job as WireJob, type JobItem } from "./gen/coseg/v1/job_pb.js";
-import type { Added, FunctionalMap, Job, Label, MapQuality, Points, Resolution, Settings } from "./types.js";
+import type { Added, FunctionalMap, Job, Label, Link, MapQuality, Points, Resolution, Settings } from "./types.js";
 import { plain, type Raw } from "./wire.js";
 
 /** Maximum number of part kinds of a collection. */
@@ -33,6 +34,13 @@ export function spec(settings: Settings): CollectionSpec {
 export function present(label: LabelInfo | undefined): Label {
   if (label === undefined) throw new BadReply("the label is missing");
   return plain(label);
+}
+
+/** What a link demands, and the part at each of its ends. */
+export function link(wire: WireLink | undefined): Link {
+  if (wire?.a === undefined || wire.b === undefined) throw new BadReply("the link, or a part of it, is missing");
+  const kind = wire.kind === LinkKind.DIFFER ? "differ" : "same";
+  return { ...plain(wire), kind, a: plain(wire.a), b: plain(wire.b) };
 }
 
 /** What rows are of, in words. */

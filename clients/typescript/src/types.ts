@@ -12,6 +12,7 @@ import type { ChooseProposalReply, ListProposalsReply } from "./gen/coseg/v1/pro
 import type { NextQuestionReply } from "./gen/coseg/v1/question_pb.js";
 import type { HelloReply, StatsReply } from "./gen/coseg/v1/daemon_pb.js";
 import type { Event as WireEvent } from "./gen/coseg/v1/event_pb.js";
+import type { Link as WireLink } from "./gen/coseg/v1/link_pb.js";
 import type { Job as WireJob, WaitIdleReply } from "./gen/coseg/v1/job_pb.js";
 import type { Shape as WireShape } from "./gen/coseg/v1/shape_pb.js";
 import type { Curve } from "./transport.js";
@@ -68,6 +69,30 @@ export type Answer = { label: number | string } | { named: string } | { skip: tr
 export interface Answered {
   readonly label?: number;
   readonly corrected?: Corrected;
+}
+/** A part of a shape, by its number. */
+export interface PartOfShape {
+  readonly shape: string;
+  readonly part: number;
+}
+/** What a link demands of the labels of two parts. */
+export type Demand = "same" | "differ";
+/** A link between two parts, which are named as they were when they were linked. */
+export type Link = Omit<Plain<WireLink>, "kind" | "a" | "b"> & {
+  readonly kind: Demand;
+  readonly a: PartOfShape;
+  readonly b: PartOfShape;
+};
+/** A link that was made or removed; `changed` is false if the same link was there. */
+export interface Linked {
+  readonly link: Link;
+  readonly changed: boolean;
+  /** Shapes whose labels wait to be recomputed. */
+  readonly nStale: number;
+  /** Number of the collection's newest event after it. */
+  readonly sequence: number;
+  /** The job that propagates it; 0 if none does. */
+  readonly jobId: bigint;
 }
 /** Whether a collection has work left. */
 export type Idle = Plain<WaitIdleReply>;

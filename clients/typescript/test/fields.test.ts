@@ -83,6 +83,9 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   listProposals: (_, c) => c.proposals(),
   getProposal: (_, c) => c.proposedLabels(1),
   chooseProposal: (_, c) => c.choose(1),
+  linkParts: (_, c) => c.same({ shape: "a", part: 0 }, { shape: "b", part: 1 }),
+  unlinkParts: (_, c) => c.unlink(1),
+  listLinks: (_, c) => c.links("a"),
 };
 
 /** The result, or what is wrong with a reply that has other rows than requested. */

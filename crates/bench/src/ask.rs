@@ -13,10 +13,10 @@ use coseg::ipc::client::ClientError;
 use coseg::ipc::convert::parse_up;
 use coseg::ipc::frames::FrameReader;
 use coseg::ipc::wire::{self, ErrorReason, answer_question_request::Answer};
-use coseg::labels::score::{ScoredShape, accuracy_by_id};
+use coseg::labels::score::{ScoredShape, accuracy_by_id, pieces};
 use coseg::mesh::FaceGeometry;
 use serde_json::{Map, Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -65,10 +65,17 @@ struct Run {
     wrong_share: f64,
 }
 
+/// Seconds that a person takes to answer for a part, and to draw the boundaries of a whole shape
+/// besides labelling its parts.
+const ANSWER_SECONDS: f64 = 2.0;
+const BOUNDARY_SECONDS: f64 = 20.0;
+
 /// The runs of one category.
 struct Row {
     name: String,
     runs: Vec<Run>,
+    /// Seconds that a person takes to label a whole shape: the mean over the shapes.
+    shape_seconds: f64,
 }
 
 impl Row {
@@ -104,8 +111,11 @@ pub(crate) fn run(args: &BenchAsk, global: &Global) -> Outcome {
         for order in 0..args.orders {
             runs.push(play(category, order, &counts, args, global)?);
         }
-        let name = category.name.clone();
-        rows.push(Row { name, runs });
+        rows.push(Row {
+            name: category.name.clone(),
+            runs,
+            shape_seconds: shape_seconds(category),
+        });
     }
     if global.json {
         print_line(&report(&rows, &counts).to_string())?;
@@ -152,6 +162,16 @@ fn play(
     run.wrong_share /= f64::from(n_answered.max(1) as u32);
     session.drain();
     Ok(run)
+}
+
+/// Seconds that a person takes to label a whole shape of a category: an answer for each connected
+/// part, and the time to draw boundaries. Mean over the shapes.
+fn shape_seconds(category: &Category) -> f64 {
+    let seconds = category.shapes.iter().map(|s| {
+        let pieces: BTreeSet<usize> = pieces(&s.mesh.faces, &s.truth).into_iter().collect();
+        ANSWER_SECONDS * f64::from(pieces.len() as u32) + BOUNDARY_SECONDS
+    });
+    mean(seconds)
 }
 
 fn next(session: &mut Session) -> Result<Option<Question>, BenchError> {
@@ -253,26 +273,27 @@ fn accuracy(
 fn lines(rows: &[Row], counts: &[usize]) -> Vec<Vec<String>> {
     let mut head = vec!["category".to_owned()];
     head.extend(counts.iter().map(|n| format!("{n} answers")));
-    head.extend(["s an answer", "wrong share"].map(str::to_owned));
+    head.extend(["s an answer", "wrong share", "person's s a shape"].map(str::to_owned));
     let mut lines = vec![head];
-    let line = |name: &str, of: &dyn Fn(usize) -> f64, seconds: f64, wrong: f64| {
+    let line = |name: &str, of: &dyn Fn(usize) -> f64, [seconds, wrong, shape]: [f64; 3]| {
         let mut line = vec![name.to_owned()];
         line.extend((0..counts.len()).map(|i| format!("{:.3}", of(i))));
         line.extend([format!("{seconds:.2}"), format!("{wrong:.3}")]);
+        line.push(format!("{shape:.0}"));
         line
     };
     for r in rows {
         lines.push(line(
             &r.name,
             &|i| r.accuracy(i),
-            r.seconds(),
-            r.wrong_share(),
+            [r.seconds(), r.wrong_share(), r.shape_seconds],
         ));
     }
     let all = |i: usize| mean(rows.iter().map(|r| r.accuracy(i)));
     let seconds = mean(rows.iter().map(Row::seconds));
     let wrong = mean(rows.iter().map(Row::wrong_share));
-    lines.push(line("mean", &all, seconds, wrong));
+    let shape = mean(rows.iter().map(|r| r.shape_seconds));
+    lines.push(line("mean", &all, [seconds, wrong, shape]));
     lines
 }
 
@@ -291,12 +312,14 @@ fn report(rows: &[Row], counts: &[usize]) -> Value {
                 "accuracy": by_count(&|i| r.accuracy(i)),
                 "seconds_per_answer": r.seconds(),
                 "wrong_share": r.wrong_share(),
+                "person_seconds_per_shape": r.shape_seconds,
                 "orders": r.runs.iter().map(|run| &run.accuracies).collect::<Vec<_>>(),
             })
         })
         .collect();
     json!({
         "accuracy": by_count(&|i| mean(rows.iter().map(|r| r.accuracy(i)))),
+        "person_seconds": by_count(&|i| ANSWER_SECONDS * f64::from(counts[i] as u32)),
         "categories": categories,
     })
 }

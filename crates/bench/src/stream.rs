@@ -13,7 +13,7 @@ use coseg::ipc::wire::{
     self, correct_labels_request::Correction, reply, request, shape_input::Source,
 };
 use coseg::labels::score::{Score, ScoreError, ScoredShape, accuracy_by_id, accuracy_open, score};
-use coseg::labels::{Baseline, DiscoveryOptions};
+use coseg::labels::{Baseline, DiscoveryOptions, Links};
 use coseg::library::Library;
 use coseg::mesh::{self, Format, TriMesh};
 use coseg::pipeline::{
@@ -465,6 +465,7 @@ fn without_maps(views: &[DescriptionView<'_>], k: usize, up: Option<[f64; 3]>) -
                 up,
                 min_gain: coseg::library::min_gain(n + 1),
                 next_label: used,
+                links: Links::default(),
             };
             let outcome = recluster(&shapes, model.as_ref(), n as u64 + 1, &options);
             next_recluster = coseg::library::next_recluster(n as u64 + 1) as usize;

@@ -128,6 +128,14 @@ pub(super) fn edit(
         Edit::ChooseProposal(r) => {
             let done = library.choose(&r.collection, r.n, &r.set, key);
             Reply::ChooseProposal(convert::chosen(&done.map_err(refused)?))
+        Edit::LinkParts(r) => {
+            let (kind, parts) = convert::new_link(&r)?;
+            let done = library.link_parts(&r.collection, kind, &parts, &r.by, key);
+            Reply::LinkParts(convert::linked(&done.map_err(refused)?))
+        }
+        Edit::UnlinkParts(r) => {
+            let done = library.unlink_parts(&r.collection, r.id, key);
+            Reply::UnlinkParts(convert::unlinked(&done.map_err(refused)?))
         }
         Edit::Undo(r) => {
             let undone = library.undo(&r.collection, key).map_err(refused)?;

@@ -2,6 +2,7 @@
 //! no field names, and lists beyond their limits.
 
 use super::errors::{error, field_error};
+use super::links::new_link;
 use crate::ipc::wire::{
     self, ErrorCode, ErrorReason, correct_labels_request::Correction, shape_input,
 };
@@ -125,6 +126,15 @@ pub fn check_review(
             Err(field_error(ErrorReason::FieldRange, "state", text))
         }
     }
+}
+
+/// Checks a link between parts.
+pub fn check_link(
+    r: &wire::LinkPartsRequest,
+    _frames: &mut NamedFrames,
+) -> Result<(), wire::Error> {
+    known::<wire::LinkKind>(r.kind, "kind")?;
+    new_link(r).map(|_| ())
 }
 
 /// Checks a request for shapes.

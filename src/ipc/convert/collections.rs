@@ -2,7 +2,9 @@
 
 use super::errors::field_error;
 use crate::ipc::wire;
-use crate::library::{CollectionInfo, CollectionSpec, LabelInfo, Up, UpEstimate, UpSet};
+use crate::library::{
+    CollectionInfo, CollectionSpec, LabelInfo, ReviewState, Up, UpEstimate, UpSet,
+};
 use crate::operators::Operator;
 
 fn up_to_wire(up: Up) -> wire::Up {
@@ -215,6 +217,19 @@ fn estimate_to_wire(estimate: UpEstimate) -> wire::UpEstimate {
     }
 }
 
+fn review_counts(info: &CollectionInfo) -> wire::ReviewCounts {
+    let count = |state: ReviewState| {
+        let found = info.reviews.iter().find(|r| r.0 == state);
+        found.map_or(0, |r| r.1)
+    };
+    wire::ReviewCounts {
+        unseen: count(ReviewState::Unseen),
+        corrected: count(ReviewState::Corrected),
+        approved: count(ReviewState::Approved),
+        doubtful: count(ReviewState::Doubtful),
+    }
+}
+
 /// A collection.
 pub fn collection(info: &CollectionInfo) -> wire::Collection {
     wire::Collection {
@@ -226,6 +241,7 @@ pub fn collection(info: &CollectionInfo) -> wire::Collection {
         up_estimate: info.up_estimate.map(estimate_to_wire),
         up_disagrees: info.up_disagrees.map(estimate_to_wire),
         n_undoable: info.n_undoable,
+        reviews: Some(review_counts(info)),
     }
 }
 

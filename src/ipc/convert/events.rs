@@ -1,5 +1,6 @@
 //! Converts the events of a collection's log.
 
+use super::links::{link_kind, part_of_shape};
 use crate::ipc::wire::{self, event::Kind};
 use crate::library::{Event, EventKind};
 
@@ -92,6 +93,15 @@ pub fn event(collection: &str, e: &Event) -> wire::Event {
             n_labels: *n_labels,
             value: *value,
         }),
+        EventKind::PartsLinked { link, kind, parts } => Kind::PartsLinked(wire::PartsLinked {
+            link: *link,
+            kind: link_kind(*kind).into(),
+            a: Some(part_of_shape(&parts[0])),
+            b: Some(part_of_shape(&parts[1])),
+        }),
+        EventKind::PartsUnlinked { link } => {
+            Kind::PartsUnlinked(wire::PartsUnlinked { link: *link })
+        }
         EventKind::Reclustered {
             score_before,
             score_after,

@@ -7,6 +7,7 @@ mod corrections;
 mod errors;
 mod events;
 mod jobs;
+mod links;
 mod proposals;
 mod questions;
 mod shapes;
@@ -17,7 +18,7 @@ pub use analysis::{
 };
 pub use checked::{
     MAX_LANDMARKS, MAX_PORTRAITS, NamedFrames, check_addition, check_correction, check_creation,
-    check_hks, check_map, check_portraits, check_review, check_reviews, check_spectrum,
+    check_hks, check_link, check_map, check_portraits, check_review, check_reviews, check_spectrum,
     check_transfer, check_update,
 };
 pub use collections::{
@@ -31,6 +32,7 @@ pub use jobs::{
     Ingest, ShapeInput, Source, add_shapes, carrying_job, format_from_wire, item, job_finished,
     mesh_format, new_shapes,
 };
+pub use links::{link, link_kind, linked, new_link, part_of_shape, unlinked};
 pub use proposals::{chosen, proposals, proposed_labels};
 pub use questions::{answer, answered, question, review, wanted_review};
 pub use shapes::{clean_report, labels, labels_snapshot, original, shape};

@@ -1,5 +1,6 @@
 //! Defines the changes by persons that can be undone, as the catalog names them.
 
+use crate::library::linked::LinkKind;
 use crate::library::rows::to_json;
 use crate::library::types::LabelId;
 use crate::store::catalog::KIND_NAME;
@@ -16,6 +17,8 @@ pub(in crate::library) enum Undoable {
     Split { label: LabelId, new: LabelId },
     Up { from: String, to: String },
     Choose { proposal: u32 },
+    Link { kind: LinkKind, parts: String },
+    Unlink { parts: String },
 }
 
 impl Undoable {
@@ -31,6 +34,8 @@ impl Undoable {
             Self::Split { .. } => "split",
             Self::Up { .. } => "up",
             Self::Choose { .. } => "choose",
+            Self::Link { kind, .. } => kind.name(),
+            Self::Unlink { .. } => "unlink",
         }
     }
 
@@ -44,6 +49,9 @@ impl Undoable {
             Self::Name => serde_json::json!({}),
             Self::Merge { label, into } => serde_json::json!({ "label": label, "into": into }),
             Self::Split { label, new } => serde_json::json!({ "label": label, "new": new }),
+            Self::Link { parts, .. } | Self::Unlink { parts } => {
+                serde_json::json!({ "parts": parts })
+            }
             Self::Up { from, to } => serde_json::json!({ "from": from, "to": to }),
             Self::Choose { proposal } => serde_json::json!({ "proposal": proposal }),
         };

@@ -10,6 +10,7 @@ use crate::library::change::Change;
 use crate::library::error::Result;
 use crate::library::event::EventKind;
 use crate::library::labelling::{Relabelled, cause, face_ids, new_labels_of};
+use crate::library::linked::{Linked, linked_shapes};
 use crate::library::sources::{FileView, Known, Sources};
 use crate::library::types::Up;
 use crate::library::voting::{
@@ -19,7 +20,7 @@ use crate::pipeline::{
     DescriptionView, LabelChange, Labelling, ReclusterOptions, Reclustering, Representative, label,
     recluster,
 };
-use crate::store::{Digest, ShapeId};
+use crate::store::{Digest, LinkRow, ShapeId};
 
 /// Maximum number of functional maps that one addition computes.
 pub const MAX_MAPS: usize = 5;
@@ -193,13 +194,9 @@ fn reclustered(
 ) -> Result<Plan> {
     let n_shapes = collection.shapes().len() + 1;
     let with = Some((new, labelling.as_ref()));
-    let found = cluster(
-        collection,
-        sources,
-        collection.up(),
-        min_gain(n_shapes),
-        with,
-    )?;
+    let links = sources.links(collection.id())?;
+    let up = collection.up();
+    let found = cluster(collection, sources, (up, &links), min_gain(n_shapes), with)?;
     let next_recluster = next_recluster(n_shapes as u64);
     let event = found.event(found.outcome.accepted);
     if let (false, Some(labelling), Some(model)) =
@@ -268,17 +265,28 @@ impl Clustered {
     }
 }
 
-/// Clusters the parts of the representatives, none of which may be stale, along the axis `up`; with
-/// a new shape, if there is one, and its labels by the model in force.
+/// Returns the stored shapes to be clustered together: those with linked parts, and others up to
+/// [`MAX_REPRESENTATIVES`].
+pub(in crate::library) fn representatives(
+    collection: &Collection,
+    links: &[LinkRow],
+) -> Vec<usize> {
+    collection.representatives_with(&linked_shapes(links), MAX_REPRESENTATIVES, &|_| true)
+}
+
+/// Clusters the parts of the representatives, none of which may be stale, along the axis `up` and
+/// as links demand; with a new shape, if there is one, and its labels by the model in force.
 fn cluster(
     collection: &Collection,
     sources: &dyn Sources,
-    up: Up,
+    (up, links): (Up, &[LinkRow]),
     min_gain: f64,
     new: Option<(&NewShape<'_>, Option<&Labelling>)>,
 ) -> Result<Clustered> {
-    let chosen = collection.representatives(MAX_REPRESENTATIVES);
+    let chosen = representatives(collection, links);
     let known = known_of(collection, sources, &chosen)?;
+    let stored: Vec<&Known> = known.iter().collect();
+    let mut demands = Linked::new(sources, links)?.demands(sources, &stored, &[]);
     let old = collection.label_model();
     let ids = |labelling: &Labelling| -> Vec<u32> {
         let labels = old.map_or(&[][..], |m| &m.labels);
@@ -308,6 +316,10 @@ fn cluster(
             labels: &new_ids,
         };
         shapes.insert(new_at, new);
+        let faces = demands.groups.iter_mut().flat_map(|g| &mut g.faces);
+        faces
+            .filter(|f| f.0 >= new_at)
+            .for_each(|(shape, _)| *shape += 1);
     }
     let up = UpFound::of(up, &shapes.iter().map(|s| &s.shape).collect::<Vec<_>>());
     let options = ReclusterOptions {
@@ -318,6 +330,7 @@ fn cluster(
         up: up.axis,
         min_gain,
         next_label: collection.row().next_label,
+        links: demands,
     };
     let outcome = recluster(&shapes, old, old.map_or(0, |m| m.epoch) + 1, &options);
     drop(shapes);
@@ -349,7 +362,7 @@ pub(in crate::library) fn up_found(
     up: Up,
     new: Option<&DescriptionView<'_>>,
 ) -> Result<UpFound> {
-    let chosen = collection.representatives(MAX_REPRESENTATIVES);
+    let chosen = representatives(collection, &sources.links(collection.id())?);
     let known = known_of(collection, sources, &chosen)?;
     let views: Vec<DescriptionView<'_>> = known.iter().map(Known::view).collect();
     Ok(UpFound::of(
@@ -365,7 +378,26 @@ pub(in crate::library) fn turn(
     sources: &dyn Sources,
     up: Up,
 ) -> Result<Change> {
-    let found = cluster(collection, sources, up, f64::NEG_INFINITY, None)?;
+    again(collection, sources, up, &sources.links(collection.id())?)
+}
+
+/// Clusters the representatives, none of which may be stale, as `links` demand. The labels in force
+/// do not compete, because they need not obey.
+pub(in crate::library) fn relinked(
+    collection: &Collection,
+    sources: &dyn Sources,
+    links: &[LinkRow],
+) -> Result<Change> {
+    again(collection, sources, collection.up(), links)
+}
+
+fn again(
+    collection: &Collection,
+    sources: &dyn Sources,
+    up: Up,
+    links: &[LinkRow],
+) -> Result<Change> {
+    let found = cluster(collection, sources, (up, links), f64::NEG_INFINITY, None)?;
     let next = next_recluster(collection.shapes().len() as u64);
     let state = State {
         chosen: collection.state().chosen,

@@ -14,6 +14,7 @@ use crate::labels::{Features, LabelModel, Normalisation, Overlap, Pinned, Statis
 use crate::library::change::{Change, map_row};
 use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause};
+use crate::library::linked::{Linked, linked_shapes};
 use crate::library::pins::{pinned_faces, pinned_share, pins_of, used_labels};
 use crate::library::rows::damaged;
 use crate::library::sources::{Known, Sources};
@@ -23,6 +24,7 @@ use crate::pipeline::{
     DescriptionView, DiscoveredLabels, FitMap, FitOptions, FitShape, FurtherEvidence, Prepared, fit,
 };
 use crate::segmentation::Surface;
+use crate::store::LinkRow;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -52,6 +54,7 @@ struct Fit<'a> {
     model: &'a LabelModel,
     /// Indices of the representatives.
     chosen: Vec<usize>,
+    links: Vec<LinkRow>,
 }
 
 /// Returns the next step of fitting the model; `None` if it is fitted, or if there is no model to
@@ -64,12 +67,14 @@ pub(in crate::library) fn step(
     let (Some(supervision), Some(model)) = (supervision, collection.label_model()) else {
         return Ok(None);
     };
+    let links = sources.links(collection.id())?;
     let fit = Fit {
         collection,
         sources,
         supervision,
         model,
-        chosen: members(collection),
+        chosen: members(collection, &links),
+        links,
     };
     if supervision.phase() != Phase::Fitted && fit.labels()?.is_empty() {
         return fit.unfounded().map(Some);
@@ -87,18 +92,18 @@ pub(in crate::library) fn step(
     }
 }
 
-/// Returns the shapes to which the model is fitted: training shapes and others, those of the least
-/// digests in each group, in the order of their digests.
-pub(in crate::library) fn members(collection: &Collection) -> Vec<usize> {
-    let shapes = collection.shapes();
-    let by_digest = collection.representatives(shapes.len());
-    let of = |pinned: bool, limit: usize| {
-        let all = by_digest.iter().copied();
-        let all = all.filter(|at| shapes[*at].pinned == pinned);
-        all.take(limit).collect::<Vec<usize>>()
-    };
-    let mut chosen = of(true, MAX_FITTED_TRAINING);
-    chosen.extend(of(false, MAX_REPRESENTATIVES - chosen.len()));
+/// Returns the shapes to which the model is fitted: training shapes and others, those with linked
+/// parts and those of the least digests in each group, in the order of their digests.
+pub(in crate::library) fn members(collection: &Collection, links: &[LinkRow]) -> Vec<usize> {
+    let linked = linked_shapes(links);
+    let shapes = collection.shapes().iter();
+    let n_linked_others = shapes
+        .filter(|s| !s.pinned && linked.contains(&s.id))
+        .count();
+    let n_training = MAX_FITTED_TRAINING.min(MAX_REPRESENTATIVES.saturating_sub(n_linked_others));
+    let mut chosen = collection.representatives_with(&linked, n_training, &|s| s.pinned);
+    let n_others = MAX_REPRESENTATIVES.saturating_sub(chosen.len());
+    chosen.extend(collection.representatives_with(&linked, n_others, &|s| !s.pinned));
     chosen
 }
 
@@ -244,6 +249,9 @@ impl Fit<'_> {
             labels,
             ..self.model.clone()
         };
+        let linked = Linked::new(self.sources, &self.links)?;
+        let known: Vec<&Known> = members.iter().map(|m| &m.known).collect();
+        let links = linked.demands(self.sources, &known, &model.labels);
         let fit_shapes: Vec<FitShape<'_>> = members
             .iter()
             .zip(&views)
@@ -269,6 +277,7 @@ impl Fit<'_> {
             statistics: &statistics,
             n_training: self.n_training(&members)?,
             discovered: discovered.as_ref(),
+            links: &links,
         };
         let fitted = fit(&fit_shapes, &maps, &further, k, &FitOptions::default());
         model.statistics = fitted.statistics;

@@ -26,6 +26,7 @@ use super::types::Up;
 use crate::labels::LabelModel;
 use crate::neighbors::SignatureMetric;
 use crate::store::{CollectionId, CollectionRow, Digest, Reader, ShapeId};
+use std::collections::BTreeSet;
 
 /// A stored shape, with the fields that placing others needs without opening its file.
 #[derive(Debug, Clone, PartialEq)]
@@ -192,6 +193,28 @@ impl Collection {
         let mut all: Vec<usize> = (0..self.shapes.len()).collect();
         all.sort_by_key(|&at| (self.shapes[at].digest, self.shapes[at].ordinal));
         all.truncate(limit);
+        all
+    }
+
+    /// Returns shapes that are `wanted`, in the order of their digests: those with an id in `first`,
+    /// and those of the least digests until there are `limit`.
+    pub(super) fn representatives_with(
+        &self,
+        first: &BTreeSet<ShapeId>,
+        limit: usize,
+        wanted: &dyn Fn(&KnownShape) -> bool,
+    ) -> Vec<usize> {
+        let mut all = self.representatives(self.shapes.len());
+        all.retain(|at| wanted(&self.shapes[*at]));
+        let is_first = |at: &usize| first.contains(&self.shapes[*at].id);
+        let n_first = all.iter().filter(|at| is_first(at)).count();
+        let mut n_others = limit.saturating_sub(n_first);
+        all.retain(|at| {
+            let is_other = !is_first(at);
+            let is_chosen = !is_other || n_others > 0;
+            n_others -= usize::from(is_chosen && is_other);
+            is_chosen
+        });
         all
     }
 

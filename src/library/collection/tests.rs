@@ -15,7 +15,8 @@ use crate::mesh::write::off;
 use crate::pipeline::{LabelChange, Prepared, describe};
 use crate::segmentation::Surface;
 use crate::store::{
-    CollectionId, CollectionRow, Digest, LabelRow, LabelVersionRow, MapRow, ShapeId, ShapeRow,
+    CollectionId, CollectionRow, Digest, LabelRow, LabelVersionRow, LinkRow, MapRow, ShapeId,
+    ShapeRow,
 };
 use crate::synth::{Family, Labelled, Options, family};
 use std::collections::BTreeMap;
@@ -92,6 +93,10 @@ impl Sources for Memory {
     }
 
     fn labels(&self, _: CollectionId) -> Result<Vec<LabelRow>> {
+        Ok(Vec::new())
+    }
+
+    fn links(&self, _: CollectionId) -> Result<Vec<LinkRow>> {
         Ok(Vec::new())
     }
 

@@ -7,7 +7,7 @@ use super::{Collection, Library};
 use crate::library::error::{LibraryError, Result};
 use crate::library::reason::Reason;
 use crate::library::types::{CollectionSpec, ItemState, NewShape, Up};
-use crate::library::{Correction, LabelId};
+use crate::library::{Correction, LabelId, LinkKind, PartName};
 use crate::mesh::write::off;
 use crate::mesh::{Format, parse};
 use crate::pipeline::{Description, Params, describe};
@@ -166,12 +166,35 @@ impl Random {
                 let up = [Up::PlusY, Up::PlusX, Up::Unknown, Up::Auto][self.below(4)];
                 ("up", library.set_up(COLLECTION, up, None).map(|_| ()))
             }
+            80..84 => ("link", self.link(library, &names)),
+            84..86 => ("unlink", self.unlink(library)),
             78..80 => ("mend", library.mend_maps(COLLECTION).map(|_| ())),
             _ => (
                 "relabel",
                 library.relabel_next(Some(COLLECTION)).map(|_| ()),
             ),
         }
+    }
+
+    fn link(&mut self, library: &Library, names: &[String]) -> Result<()> {
+        let mut part = || PartName {
+            shape: names
+                .get(self.below(names.len()))
+                .cloned()
+                .unwrap_or_default(),
+            part: self.below(3) as u32,
+        };
+        let parts = [part(), part()];
+        let kind = [LinkKind::Same, LinkKind::Differ][self.below(2)];
+        let linked = library.link_parts(COLLECTION, kind, &parts, "", None);
+        linked.map(|_| ())
+    }
+
+    fn unlink(&mut self, library: &Library) -> Result<()> {
+        let links = library.links(COLLECTION, None)?;
+        let at = self.below(links.len());
+        let id = links.get(at).map_or(0, |l| l.id);
+        library.unlink_parts(COLLECTION, id, None).map(|_| ())
     }
 
     fn correct(&mut self, library: &Library, name: &str) -> Result<()> {
@@ -230,6 +253,7 @@ fn the_collection_in_memory_is_the_stored_one_after_every_operation() {
     assert!(n_compared > n_operations / 2, "{n_compared} were compared");
     let kinds = [
         "add", "replace", "remove", "correct", "merge", "split", "name", "undo", "up", "relabel",
+        "link", "unlink",
     ];
     for kind in kinds {
         assert!(

@@ -9,6 +9,7 @@ mod collections;
 mod corrections;
 mod jobs;
 mod labels;
+mod links;
 pub(in crate::store) mod log;
 mod maps;
 mod proposals;

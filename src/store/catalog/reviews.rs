@@ -33,6 +33,22 @@ impl Reader<'_> {
         Ok(rows.into_iter().collect())
     }
 
+    /// Number of shapes of a collection with a verdict.
+    pub fn n_reviews(&self, collection: CollectionId, state: &str) -> Result<u64> {
+        let sql = "SELECT count(*) FROM shapes JOIN reviews ON shape_id = shapes.id
+                   WHERE collection_id = ?1 AND state = ?2";
+        self.number(sql, params![collection, state])
+    }
+
+    /// Number of shapes of a collection that have pins and no verdict, as an earlier version left
+    /// them.
+    pub fn n_pinned_without_review(&self, collection: CollectionId) -> Result<u64> {
+        let sql = "SELECT count(*) FROM shapes JOIN pins ON shape_id = shapes.id
+                   WHERE collection_id = ?1
+                   AND NOT EXISTS (SELECT 1 FROM reviews WHERE shape_id = shapes.id)";
+        self.number(sql, [collection])
+    }
+
     /// The parts in a collection that persons did not want to label, by shape and part.
     pub fn passed_parts(&self, collection: CollectionId) -> Result<Vec<PassedPart>> {
         let tail = "WHERE shape_id IN (SELECT id FROM shapes WHERE collection_id = ?1)

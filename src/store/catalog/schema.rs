@@ -11,7 +11,7 @@ use rusqlite::types::ValueRef;
 use rusqlite::{Connection, params};
 
 /// Version of the catalog's tables; newer ones are rejected.
-pub const CATALOG_FORMAT: u32 = 5;
+pub const CATALOG_FORMAT: u32 = 6;
 
 /// The format before corrections: it lacks the tables in [`SINCE_FORMAT_2`].
 const WITHOUT_CORRECTIONS: u32 = 1;
@@ -25,6 +25,8 @@ const WITHOUT_REVIEWS: u32 = 3;
 
 /// The format before proposals: it lacks the tables in [`SINCE_FORMAT_5`].
 const WITHOUT_PROPOSALS: u32 = 4;
+/// The format before links between parts: it lacks the table in [`SINCE_FORMAT_6`].
+const WITHOUT_LINKS: u32 = 5;
 
 /// `cseg`, the application id in the header of the SQLite file.
 const APPLICATION_ID: u32 = u32::from_be_bytes(*b"cseg");
@@ -189,6 +191,17 @@ tables! {
      basis TEXT NOT NULL, n_labels INTEGER NOT NULL, value REAL NOT NULL, labels BLOB NOT NULL,
      sum INTEGER, PRIMARY KEY (collection_id, n)"
 
+    LINKS "links" key 1 [
+        "id", "collection_id", "kind", "shape_a", "part_a", "polygons_a", "shape_b", "part_b",
+        "polygons_b", "person", "unix_ms",
+    ]
+    "id INTEGER PRIMARY KEY AUTOINCREMENT,
+     collection_id INTEGER NOT NULL REFERENCES collections ON DELETE CASCADE, kind TEXT NOT NULL,
+     shape_a INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part_a INTEGER NOT NULL,
+     polygons_a BLOB NOT NULL,
+     shape_b INTEGER NOT NULL REFERENCES shapes ON DELETE CASCADE, part_b INTEGER NOT NULL,
+     polygons_b BLOB NOT NULL, person TEXT NOT NULL, unix_ms INTEGER NOT NULL, sum INTEGER"
+
     LABELS_BEFORE "labels_before" key 2 [
         "correction_id", "shape_id", "version", "label_epoch", "parts", "area_shares",
     ]
@@ -259,6 +272,16 @@ const SINCE_FORMAT_4: [&Table; 2] = [&REVIEWS, &PASSED_PARTS];
 /// Tables that format 5 added.
 const SINCE_FORMAT_5: [&Table; 2] = [&CANDIDATES, &PROPOSALS];
 
+/// The table that format 6 added.
+const SINCE_FORMAT_6: [&Table; 1] = [&LINKS];
+
+/// Indexes of this table, by which the removal of a shape finds its links.
+const INDEXES_SINCE_FORMAT_6: &str = "
+    CREATE INDEX links_by_collection ON links (collection_id, id);
+    CREATE INDEX links_by_a ON links (shape_a);
+    CREATE INDEX links_by_b ON links (shape_b);
+";
+
 const INDEXES: &str = "
     CREATE INDEX stale_shapes ON shapes (collection_id, ordinal) WHERE stale;
     CREATE INDEX shapes_by_content ON shapes (content_digest);
@@ -313,6 +336,7 @@ pub(super) fn prepare(connection: &mut Connection, path: &str) -> Result<(), Sto
     tx.execute_batch(INDEXES)?;
     tx.execute_batch(INDEXES_SINCE_FORMAT_2)?;
     tx.execute_batch(INDEXES_SINCE_FORMAT_3)?;
+    tx.execute_batch(INDEXES_SINCE_FORMAT_6)?;
     tx.execute(
         "INSERT INTO meta (key, value) VALUES ('library_id', lower(hex(randomblob(16)))), (?1, ?2)",
         params!["format", CATALOG_FORMAT.to_string()],
@@ -331,7 +355,11 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
     let found = pragma("user_version")?;
     let is_old = matches!(
         found,
-        WITHOUT_CORRECTIONS | WITHOUT_CONFIDENCE | WITHOUT_REVIEWS | WITHOUT_PROPOSALS
+        WITHOUT_CORRECTIONS
+            | WITHOUT_CONFIDENCE
+            | WITHOUT_REVIEWS
+            | WITHOUT_PROPOSALS
+            | WITHOUT_LINKS
     );
     if pragma("application_id")? != APPLICATION_ID || !is_old {
         return Ok(());
@@ -354,9 +382,15 @@ fn upgrade(connection: &mut Connection) -> Result<(), StoreError> {
             tx.execute_batch(&table.create())?;
         }
     }
-    for table in SINCE_FORMAT_5 {
+    if found < WITHOUT_LINKS {
+        for table in SINCE_FORMAT_5 {
+            tx.execute_batch(&table.create())?;
+        }
+    }
+    for table in SINCE_FORMAT_6 {
         tx.execute_batch(&table.create())?;
     }
+    tx.execute_batch(INDEXES_SINCE_FORMAT_6)?;
     tx.execute(
         "UPDATE meta SET value = ?1 WHERE key = 'format'",
         [CATALOG_FORMAT.to_string()],

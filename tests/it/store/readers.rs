@@ -102,25 +102,23 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
             .execute_batch(sql)
             .expect("runs");
     };
+    let since_6 = "DROP TABLE links;";
     let since_5 = "DROP TABLE candidates; DROP TABLE proposals;";
     let since_4 = "DROP TABLE reviews; DROP TABLE passed_parts;";
     let since_3 = "DROP TABLE point_maps; DROP TABLE map_confidence;";
     let since_2 = "DROP TABLE labels_before; DROP TABLE corrections; DROP TABLE pins;";
-    old(&format!("{since_5} PRAGMA user_version = 4"));
-    drop(Store::open(&library)?);
-    assert_eq!(format(), 5);
-    let since_4 = format!("{since_5} {since_4}");
-    old(&format!("{since_4} PRAGMA user_version = 3"));
-    drop(Store::open(&library)?);
-    assert_eq!(format(), 5);
-    old(&format!("{since_4} {since_3} PRAGMA user_version = 2"));
-    drop(Store::open(&library)?);
-    assert_eq!(format(), 5);
-    old(&format!(
-        "{since_4} {since_3} {since_2} PRAGMA user_version = 1"
-    ));
+    for (dropped, of_format) in [
+        (since_6.to_owned(), 5),
+        (format!("{since_6} {since_5}"), 4),
+        (format!("{since_6} {since_5} {since_4}"), 3),
+        (format!("{since_6} {since_5} {since_4} {since_3}"), 2),
+        (format!("{since_6} {since_5} {since_4} {since_3} {since_2}"), 1),
+    ] {
+        old(&format!("{dropped} PRAGMA user_version = {of_format}"));
+        drop(Store::open(&library)?);
+        assert_eq!(format(), 6, "from format {of_format}");
+    }
     let store = Store::open(&library)?;
-    assert_eq!(format(), 5);
     let new = coseg::store::NewCollection {
         name: "old".into(),
         ..Default::default()
@@ -144,14 +142,14 @@ fn newer_and_foreign_catalogs_are_refused() -> Result<()> {
         let connection = rusqlite::Connection::open(&catalog).expect("opens");
         connection.execute_batch(sql).expect("runs");
     };
-    change("PRAGMA user_version = 6");
+    change("PRAGMA user_version = 7");
     let newer = Store::open(&library).err().expect("refused");
     assert!(
         matches!(
             newer,
             StoreError::Version {
-                found: 6,
-                supported: 5,
+                found: 7,
+                supported: 6,
                 ..
             }
         ),

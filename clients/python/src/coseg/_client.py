@@ -638,7 +638,7 @@ class Collection:
         return found[0]
 
     def undo(self) -> t.Undone:
-        """Takes back the newest correction, name, merge, split, change of the up axis or choice."""
+        """Takes back the newest correction, name, merge, split, link, change of the up axis or choice."""
         reply, _ = self._call("undo")
         return wire.flat(t.Undone, reply)
 
@@ -686,6 +686,29 @@ class Collection:
         state = wire.review_state("doubtful" if doubtful else "approved")
         reply, _ = self._call("review_shape", shape=name, state=state, by=by)
         return wire.flat(t.Corrected, reply.corrected) if reply.HasField("corrected") else None
+
+    def same(self, a: tuple[str, int], b: tuple[str, int], *, by: str = "") -> t.Linked:
+        """Demands that two parts, each a shape and the number of its part, have the same label."""
+        return self._link("same", a, b, by)
+
+    def differ(self, a: tuple[str, int], b: tuple[str, int], *, by: str = "") -> t.Linked:
+        """Demands that two parts, each a shape and the number of its part, have different labels."""
+        return self._link("differ", a, b, by)
+
+    def _link(self, kind: str, a: tuple[str, int], b: tuple[str, int], by: str) -> t.Linked:
+        ends = {"a": wire.part_of_shape(a), "b": wire.part_of_shape(b)}
+        reply, _ = self._call("link_parts", kind=wire.link_kind(kind), by=by, **ends)
+        return wire.linked(reply)
+
+    def unlink(self, id: int) -> t.Unlinked:
+        """Removes the link with this id."""
+        reply, _ = self._call("unlink_parts", id=id)
+        return wire.flat(t.Unlinked, reply, link=wire.link(reply.link))
+
+    def links(self, shape: str = "") -> list[t.Link]:
+        """Links between parts, the oldest first; with ``shape`` only those of its parts."""
+        reply, _ = self._call("list_links", shape=shape)
+        return [wire.link(link) for link in reply.links]
 
     def suggest(self) -> t.Suggestion | None:
         """The shape whose labelling by a person would help most, or ``None`` if there is none."""

@@ -24,6 +24,7 @@ from coseg.v1 import (
     daemon_pb2,
     event_pb2,
     job_pb2,
+    link_pb2,
     message_pb2,
     portrait_pb2,
     proposal_pb2,
@@ -234,6 +235,33 @@ def review_state(name: str) -> Any:
     return _value(review_pb2.ReviewState, f"REVIEW_STATE_{name.upper()}", f"review is {name!r}")
 
 
+def link_kind(name: str) -> Any:
+    """What a link demands, by its name."""
+    return _value(link_pb2.LinkKind, f"LINK_KIND_{name.upper()}", f"kind is {name!r}")
+
+
+def part_of_shape(part: tuple[str, int]) -> link_pb2.PartOfShape:
+    """A part by its shape and its number."""
+    shape, number = part
+    return link_pb2.PartOfShape(shape=shape, part=number)
+
+
+def link(message: link_pb2.Link) -> t.Link:
+    """A link between two parts."""
+    return flat(
+        t.Link,
+        message,
+        kind=enum_name(link_pb2.LinkKind, "LINK_KIND_", message.kind),
+        a=(message.a.shape, message.a.part),
+        b=(message.b.shape, message.b.part),
+    )
+
+
+def linked(reply: link_pb2.LinkPartsReply) -> t.Linked:
+    """A link that was made."""
+    return flat(t.Linked, reply, link=link(reply.link))
+
+
 def question(reply: question_pb2.NextQuestionReply, raw: Raw) -> t.Question:
     """The part to ask a person about."""
     return flat(
@@ -273,6 +301,7 @@ def collection(message: collection_pb2.Collection) -> t.CollectionInfo:
         operator=enum_name(collection_pb2.Operator, "OPERATOR_", spec.operator).replace("_", "-"),
         working_faces=spec.working_faces,
         labels=tuple(map(label, message.labels)),
+        reviews=flat(t.ReviewCounts, message.reviews),
         **estimates,
     )
 

@@ -99,6 +99,16 @@ class UpEstimate:
 
 
 @dataclass(frozen=True)
+class ReviewCounts:
+    """Numbers of shapes by the verdict of persons on their labels."""
+
+    unseen: int = 0
+    corrected: int = 0
+    approved: int = 0
+    doubtful: int = 0
+
+
+@dataclass(frozen=True)
 class CollectionInfo:
     """A collection as it stands."""
 
@@ -121,6 +131,8 @@ class CollectionInfo:
     up_disagrees: UpEstimate | None = None
     #: Changes by a person that ``undo`` can take back.
     n_undoable: int = 0
+    #: Shapes by the verdict of persons.
+    reviews: ReviewCounts = ReviewCounts()
 
     def _repr_html_(self) -> str:
         return _html.collection(self)
@@ -488,12 +500,60 @@ class Corrected:
 
 
 @dataclass(frozen=True)
+class Link:
+    """A link between two parts, each a shape and the number that its part had when it was linked."""
+
+    id: int
+    #: ``"same"`` or ``"differ"``: what it demands of the labels.
+    kind: str
+    a: tuple[str, int]
+    b: tuple[str, int]
+    #: Who made it; may be empty.
+    by: str
+    #: When, in milliseconds since 1970.
+    unix_ms: int
+    #: Whether the present labels are as demanded.
+    holds: bool
+    #: Whether labels that persons gave contradict it; then it demands nothing.
+    overruled: bool
+
+
+@dataclass(frozen=True)
+class Linked:
+    """A link that was made."""
+
+    link: Link
+    #: Whether anything changed: not if the same link was there.
+    changed: bool
+    #: Shapes whose labels wait to be recomputed.
+    n_stale: int
+    #: Number of the collection's newest event after it.
+    sequence: int
+    #: The job that propagates it; 0 if none does.
+    job_id: int
+
+
+@dataclass(frozen=True)
+class Unlinked:
+    """A link that was removed."""
+
+    #: As it was.
+    link: Link
+    #: Shapes whose labels wait to be recomputed.
+    n_stale: int
+    #: Number of the collection's newest event after it.
+    sequence: int
+    #: The job that propagates it; 0 if none does.
+    job_id: int
+
+
+@dataclass(frozen=True)
 class Undone:
     """What was undone: ``"correct"``, ``"answer"``, ``"approve"``, ``"doubt"``, ``"name"``,
-    ``"merge"``, ``"split"``, ``"up"`` or ``"choose"``."""
+    ``"merge"``, ``"split"``, ``"up"``, ``"choose"``, ``"same"``, ``"differ"`` or ``"unlink"``."""
 
     change: str
-    #: What it changed: a shape, a label, an axis or a proposal.
+    #: What it changed: a shape, a label, an axis, a proposal or two parts.
     subject: str
     #: Changes that can still be undone.
     n_left: int
