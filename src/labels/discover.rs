@@ -221,7 +221,6 @@ pub fn discover(
         Some(_) => (fewest, pool(&shapes, &criterion, fewest, options.seed)),
         None => estimate(&shapes, &criterion, options),
     };
-    let k = pool.0;
     let chosen = choose(&shapes, &criterion, pool, options.seed, current);
     let mut found = chosen.unwrap_or_else(|| {
         // With fewer patches than labels, each patch gets a label of its own.

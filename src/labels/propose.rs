@@ -241,6 +241,7 @@ pub fn agreement(a: &[u32], b: &[u32], weights: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Links;
     use super::super::test_shapes::Strips;
     use super::*;
 

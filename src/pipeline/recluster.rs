@@ -3,8 +3,8 @@
 
 use super::{DescriptionView, Labelling, Prepared};
 use crate::labels::{
-    Baseline, Candidate, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel,
-    Links, Normalisation, Proposal, ShapeInput, Statistics, baseline, candidates, discover, propose,
+    Baseline, Candidate, Discovery, DiscoveryInput, DiscoveryOptions, Features, LabelModel, Links,
+    Normalisation, Proposal, ShapeInput, Statistics, baseline, candidates, discover, propose,
 };
 use crate::linalg::assignment::assignment;
 use crate::segmentation::{PatchGraph, Surface};
@@ -105,12 +105,19 @@ pub fn adopt(
     let views: Vec<DescriptionView<'_>> = shapes.iter().map(|s| s.shape).collect();
     let together = Together::new(&views, options.up);
     let current = old.map(|model| current_classes(shapes, model));
-    let found = Discovery {
+    let mut found = Discovery {
         labels: found.labels,
         n_labels: found.n_labels,
         value: found.value,
         current_value: f64::NEG_INFINITY,
     };
+    // With too few labels for the demands, the person's choice counts.
+    if options.links.fewest_classes(found.n_labels).is_some() {
+        let area = |shape: usize, face: u32| together.prepared[shape].surface.area[face as usize];
+        options
+            .links
+            .repair(&mut found.labels, found.n_labels, area);
+    }
     let options = ReclusterOptions {
         min_gain: f64::NEG_INFINITY,
         ..options.clone()

@@ -52,8 +52,7 @@ pub use rows::{
     CandidatesRow, CollectionId, CollectionRow, CorrectionRow, ItemStatus, JobItemRow, LabelRow,
     LabelSummary, LabelVersionRow, LabelsBefore, LinkEnd, LinkRow, MapRow, NewCollection,
     NewJobItem, NewShapeRow, ObjectKind, ObjectRow, PassedPart, PointMapRow, ProposalRow,
-    RequestRow, ReviewRow, ShapeId,
-    ShapeRow,
+    RequestRow, ReviewRow, ShapeId, ShapeRow,
 };
 
 use disk::{Disk, RealDisk};

@@ -128,6 +128,7 @@ pub(super) fn edit(
         Edit::ChooseProposal(r) => {
             let done = library.choose(&r.collection, r.n, &r.set, key);
             Reply::ChooseProposal(convert::chosen(&done.map_err(refused)?))
+        }
         Edit::LinkParts(r) => {
             let (kind, parts) = convert::new_link(&r)?;
             let done = library.link_parts(&r.collection, kind, &parts, &r.by, key);

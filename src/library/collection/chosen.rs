@@ -7,6 +7,7 @@ use crate::labels::{DiscoveryOptions, Proposal};
 use crate::library::change::Change;
 use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause, face_ids, new_labels_of};
+use crate::library::linked::Linked;
 use crate::library::sources::{Known, Sources};
 use crate::pipeline::{ReclusterOptions, Representative, adopt};
 
@@ -32,6 +33,8 @@ pub(in crate::library) fn choose(
     let known = at.iter().map(|at| sources.known(shapes[*at].id));
     let known: Vec<Known> = known.collect::<Result<_>>()?;
     let old = collection.label_model();
+    let stored: Vec<&Known> = known.iter().collect();
+    let links = Linked::new(sources, &sources.links(collection.id())?)?;
     let ids: Vec<Vec<u32>> = known
         .iter()
         .map(|k| face_ids(&k.labels.proxy_labels))
@@ -49,6 +52,7 @@ pub(in crate::library) fn choose(
         up: old.and_then(|m| m.up),
         min_gain: f64::NEG_INFINITY,
         next_label: collection.row().next_label,
+        links: links.demands(sources, &stored, &[]),
     };
     let n_labels = division.n_labels as u32;
     let epoch = old.map_or(0, |m| m.epoch) + 1;

@@ -112,7 +112,10 @@ fn catalogs_of_older_formats_are_brought_to_this_one() -> Result<()> {
         (format!("{since_6} {since_5}"), 4),
         (format!("{since_6} {since_5} {since_4}"), 3),
         (format!("{since_6} {since_5} {since_4} {since_3}"), 2),
-        (format!("{since_6} {since_5} {since_4} {since_3} {since_2}"), 1),
+        (
+            format!("{since_6} {since_5} {since_4} {since_3} {since_2}"),
+            1,
+        ),
     ] {
         old(&format!("{dropped} PRAGMA user_version = {of_format}"));
         drop(Store::open(&library)?);
