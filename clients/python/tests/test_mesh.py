@@ -12,7 +12,7 @@ import numpy as np
 import potpourri3d
 import pytest
 import trimesh
-from shapes import icosphere, lumpy, sphere
+from shapes import icosphere, lumpy, renumbered, sphere
 
 import coseg
 from coseg.geometry import Geodesics, Mesh
@@ -209,6 +209,16 @@ def test_geodesics_on_a_plane_are_straight() -> None:
         found = plane.geodesics(source)[0]
         assert np.abs(found - exact).mean() < 0.01 * exact.max()
         assert np.abs(found - exact).max() < 0.03 * exact.max()
+
+
+def test_geodesics_depend_on_no_order_and_no_unit() -> None:
+    vertices, faces = lumpy(3)
+    found = Mesh(vertices, faces).geodesics(5)[0]
+    points, corners, old = renumbered(vertices, faces)
+    other = Mesh(points, corners).geodesics(np.flatnonzero(old == 5))[0]
+    assert np.allclose(other, found[old], atol=1e-9)
+    assert np.allclose(Mesh(vertices, faces[:, ::-1]).geodesics(5)[0], found, atol=1e-9)
+    assert np.allclose(Mesh(1000 * vertices, faces).geodesics(5)[0] / 1000, found, atol=1e-9)
 
 
 def test_geodesics_agree_with_another_implementation() -> None:

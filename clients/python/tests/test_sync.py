@@ -145,7 +145,7 @@ def test_spectra_and_maps_are_arrays(chairs: coseg.Collection, meshes: list[Path
     assert len(nearest) == 2 and nearest[0].distance <= nearest[1].distance
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def coarse(shared: Daemon, meshes: list[Path]) -> Iterator[coseg.Collection]:
     """Two chairs whose working meshes are coarser than their files."""
     with coseg.Library(shared.endpoint) as lib:

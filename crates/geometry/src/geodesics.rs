@@ -3,8 +3,8 @@
 //! Crane, Weischedel and Wardetzky, *Geodesics in Heat*, 2013: heat flows from the source for a
 //! short time, its gradient points away from the source everywhere, and the function whose gradient
 //! has that direction and length 1 is the distance. All three steps are on the triangles of the
-//! tufted cover (Sharp and Crane 2020), so any mesh that has a Laplacian has distances: holes, edges
-//! of three faces, slivers and faces without an orientation included.
+//! tufted cover (Sharp and Crane 2020), so any mesh that has a Laplacian has distances: with holes,
+//! edges of three faces, slivers and faces without an orientation.
 //!
 //! Both systems are factorised once; a source then costs two solves.
 
@@ -133,9 +133,9 @@ impl HeatGeodesics {
         self.component.len()
     }
 
-    /// Distances `(s, n)`, row-major, from each of the sources `(s,)` to each vertex, in the unit of
-    /// the coordinates: 0 at the source, never negative, infinite in other components. O(n log n)
-    /// for each source, about [`BATCH`] of which cost as much as one.
+    /// Distances `(s, n)`, row-major, from each of the sources `(s,)` to each vertex, in the unit
+    /// of the coordinates: 0 at the source, never negative, infinite in other components. O(n log
+    /// n) for each source; [`BATCH`] of them share a solve.
     ///
     /// # Errors
     /// If a source does not exist, or the mesh is so many edges across (about 1,000 at time 1) that

@@ -10,10 +10,13 @@ const MEMORY_FILE: &str = "crates/geometry/src/linalg/basis.rs";
 /// The pure files that read and write JSON: that of a file format.
 const JSON_FILES: [&str; 5] = [
     "crates/geometry/src/mesh/parse/gltf/document.rs",
+    "crates/geometry/src/mesh/write/attributes.rs",
+    "crates/geometry/src/mesh/write/attributes/tests.rs",
     "crates/geometry/src/mesh/write/glb.rs",
     "crates/geometry/src/mesh/write/gltf.rs",
     "crates/geometry/src/mesh/write/gltf/tests.rs",
     "crates/geometry/src/mesh/write/obj_glb.rs",
+    "crates/geometry/src/mesh/write/paint.rs",
 ];
 /// Maximum number of lines of a source file.
 const MAX_LINES: usize = 700;

@@ -17,7 +17,8 @@ fn file() -> Vec<u8> {
     let colours = document.attribute(&[[1.0, 0.0, 0.214]; 4]);
     let too_few = document.attribute(&[[0.0, 0.0, 1.0]; 3]);
     let (one, two) = (document.indices(&[0, 1, 2]), document.indices(&[0, 2, 3]));
-    let oak = json!({ "name": "dark oak", "pbrMetallicRoughness": { "baseColorFactor": [0.214, 1, 0, 1] } });
+    let shading = json!({ "baseColorFactor": [0.214, 1, 0, 1] });
+    let oak = json!({ "name": "dark oak", "pbrMetallicRoughness": shading });
     document.push("materials", json!({}));
     document.push("materials", oak);
     let primitives = json!([
