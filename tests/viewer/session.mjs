@@ -171,7 +171,7 @@ async function correct() {
   await page.keyboard.press("Enter");
   await page.waitForSelector("#apply:disabled");
   await think(GLANCE_MS);
-  await note("Enter", `${shape} is corrected`, true);
+  await note("Enter", `${shape} is corrected`);
   if (!fresh) return;
   await press(`#legend [data-label="${fresh.label}"] .pencil`);
   await page.keyboard.type(fresh.name, { delay: 60 });
@@ -192,12 +192,12 @@ async function compare() {
   await think(GLANCE_MS);
 }
 
-await note("", "20 vases as they were found, without any label by a person", true);
+await note("nothing yet", "20 vases as they were found, without any label by a person", true);
 await sortLabels();
 await think(GLANCE_MS);
 await page.keyboard.press("q");
 await page.waitForSelector("#ask-name");
-for (let n = 0; n < N_QUESTIONS; n++) await note(...(await answer()), n < 2);
+for (let n = 0; n < N_QUESTIONS; n++) await note(...(await answer()), n === 1);
 await correct();
 await compare();
 await page.keyboard.press("y");
@@ -208,7 +208,7 @@ await page.waitForSelector("#editor:not([hidden])");
 await press("#label-split");
 await page.waitForSelector("#editor", { state: "hidden" });
 await think(GLANCE_MS);
-await note("l, Split in two", "a split that was not wanted", true);
+await note("l, Split in two", "a split that was not wanted");
 await page.keyboard.press("Control+z");
 await page.waitForFunction(() =>
   [...document.querySelectorAll(".toast")].some((t) => t.textContent.startsWith("Undone")),

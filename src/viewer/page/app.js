@@ -404,6 +404,7 @@ class App {
     this.stage.close();
     $("stage").hidden = $("panel").hidden = true;
     $("main").classList.remove("open");
+    placeToasts();
     this.gallery.select(null);
     if (inside) this.gallery.cards.get(selected)?.focus();
   }
