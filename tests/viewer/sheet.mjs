@@ -2,7 +2,7 @@
 
 import { readFileSync } from "node:fs";
 
-const WIDTH = 480;
+const WIDTH = 440;
 const COLUMNS = 3;
 
 /** Writes `session.png`: the pictures of the steps that are marked, each with its time below. */

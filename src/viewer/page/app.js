@@ -104,11 +104,16 @@ class App {
     );
   }
 
-  async events() {
+  /** Returns all events. One call after the other reads those that are new. */
+  events() {
     if (!this.source.live) return this.source.events();
-    const last = this.log.at(-1)?.sequence ?? 0;
-    this.log.push(...(await this.source.events(this.name, last)).filter((e) => e.sequence > last));
-    return this.log;
+    const { log, name } = this;
+    const read = async () => {
+      const last = log.at(-1)?.sequence ?? 0;
+      log.push(...(await this.source.events(name, last)).filter((e) => e.sequence > last));
+      return log;
+    };
+    return (this.reading = (this.reading ?? Promise.resolve()).then(read, read));
   }
 
   /** Returns the shapes from which a map to `name` can be shown, best first. */
@@ -399,6 +404,7 @@ class App {
     this.stage.close();
     $("stage").hidden = $("panel").hidden = true;
     $("main").classList.remove("open");
+    placeToasts();
     this.gallery.select(null);
     if (inside) this.gallery.cards.get(selected)?.focus();
   }

@@ -47,7 +47,8 @@ class Changes {
   /** Begins to follow what a change moves. Names and doubts move nothing. */
   begin(since, change, text) {
     const moves = change?.path !== "name" && change?.body.state !== "doubtful";
-    this.newest = moves ? { since, text, portraits: new Map(), moved: new Map() } : null;
+    if (!moves) return;
+    this.newest = { since, text, portraits: new Map(), moved: new Map() };
     this.shows = "after";
   }
 

@@ -114,6 +114,11 @@ class EmbeddedSource {
   }
 }
 
+/** Status of an answer that has no room yet; a read is then tried again after so long. */
+const BUSY = 503;
+const BUSY_MS = 300;
+const MAX_TRIES = 4;
+
 /** Reads from the daemon that serves this page. */
 class LiveSource {
   constructor() {
@@ -122,9 +127,12 @@ class LiveSource {
 
   async fetch(path, parameters = {}) {
     const query = new URLSearchParams(parameters);
-    const response = await fetch(`api/${path}?${query}`);
-    if (!response.ok) throw new Error(await refusal(response));
-    return response;
+    for (let tries = 1; ; tries++) {
+      const response = await fetch(`api/${path}?${query}`);
+      if (response.ok) return response;
+      if (response.status !== BUSY || tries === MAX_TRIES) throw new Error(await refusal(response));
+      await new Promise((resolve) => setTimeout(resolve, tries * BUSY_MS));
+    }
   }
 
   async json(path, parameters) {

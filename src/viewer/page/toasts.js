@@ -4,9 +4,8 @@
 const TOAST_MS = 5_000;
 const FAULT_MS = 9_000;
 
-function showToast(text, bad = false) {
-  const toast = make("div", { className: bad ? "toast bad" : "toast" }, text);
-  // Above the shapes, so that it covers nothing that can be pressed.
+/** Puts the messages above the shapes, so that they cover nothing that can be pressed. */
+function placeToasts() {
   const box = (
     $("stage").hidden ? $("main") : document.querySelector(".scene")
   ).getBoundingClientRect();
@@ -16,6 +15,11 @@ function showToast(text, bad = false) {
   };
   for (const [side, pixels] of Object.entries(room))
     $("toasts").style[side] = `${Math.round(pixels)}px`;
+}
+
+function showToast(text, bad = false) {
+  const toast = make("div", { className: bad ? "toast bad" : "toast" }, text);
+  placeToasts();
   $("toasts").append(toast);
   setTimeout(() => toast.remove(), bad ? FAULT_MS : TOAST_MS);
 }
