@@ -94,8 +94,8 @@ fn show_collection(c: &wire::Collection, session: &Session) -> Outcome {
     let area: f64 = unclaimed.clone().map(|l| l.area_share).sum();
     if let n @ 1.. = unclaimed.count() as u64 {
         session.line(&format!(
-            "{:.1} % of the area has {} that no labelled shape shows: name, merge or label them, or \
-             say `coseg correct --closed` if there are no such parts",
+            "{:.1} % of the area has {} that no labelled shape shows: name, merge or label them, \
+             or say `coseg correct --closed` if there are no such parts",
             100.0 * area,
             counted(n, "discovered label")
         ))?;

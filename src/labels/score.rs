@@ -171,8 +171,9 @@ fn assigned(overlap: &[f64], rows: &[i32], columns: &[i32]) -> BTreeMap<i32, i32
 }
 
 /// Returns the mean over shapes of the area share with the right label, where persons gave the
-/// labels `given` and no others. These must *be* the true ones. Predicted labels that no person gave
-/// stand for true labels that no person gave, by one assignment, one to one, that serves all shapes.
+/// labels `given` and no others. These must *be* the true ones. Predicted labels that no person
+/// gave stand for true labels that no person gave, by one assignment, one to one, that serves all
+/// shapes.
 pub fn accuracy_open(shapes: &[ScoredShape<'_>], given: &BTreeSet<i32>) -> Result<f64, ScoreError> {
     if shapes.is_empty() {
         return Err(ScoreError::Empty);

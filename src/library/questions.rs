@@ -72,8 +72,8 @@ pub struct OfferedLabel {
 pub enum Answer {
     /// The part has this label.
     Label(LabelId),
-    /// The part has the label of this name. If no label is named so, the discovered label of most of
-    /// the part gets the name, or a new label if a person has used or named that one.
+    /// The part has the label of this name. If no label is named so, the discovered label of most
+    /// of the part gets the name, or a new label if a person has used or named that one.
     Named(String),
     /// The person passes the question over.
     Skip,

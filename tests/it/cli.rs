@@ -241,8 +241,8 @@ fn a_folder_becomes_labelled_shapes_and_files() {
     );
     assert_eq!(names(&listed), ["9", "10", "Big One"]);
     let table = stdout(&home.coseg(&["ls"]), 0);
-    let heading = "collection  shapes  stale  labels  parts  up       sequence  unseen  corrected  approved  \
-         doubtful\nskittles    3       0 ";
+    let heading = "collection  shapes  stale  labels  parts  up       sequence  unseen  \
+         corrected  approved  doubtful\nskittles    3       0 ";
     assert!(table.starts_with(heading), "{table}");
 
     let labels = stdout(&home.coseg(&["labels", "Big One"]), 0);

@@ -196,8 +196,8 @@ impl Collection {
         all
     }
 
-    /// Returns shapes that are `wanted`, in the order of their digests: those with an id in `first`,
-    /// and those of the least digests until there are `limit`.
+    /// Returns shapes that are `wanted`, in the order of their digests: those with an id in
+    /// `first`, and those of the least digests until there are `limit`.
     pub(super) fn representatives_with(
         &self,
         first: &BTreeSet<ShapeId>,

@@ -85,9 +85,11 @@ impl Reader<'_> {
         )
     }
 
-    /// For each label the number of shapes of a collection whose newest labels contain it.
+    /// For each label the number of shapes of a collection whose newest labels contain it, and the
+    /// sum of its area shares there.
     pub fn label_uses(&self, collection: CollectionId) -> Result<BTreeMap<u32, (u64, f64)>> {
-        let sql = "SELECT label, count(*), total(area_share) FROM shape_labels JOIN shapes ON shapes.id = shape_id
+        let sql = "SELECT label, count(*), total(area_share)
+                   FROM shape_labels JOIN shapes ON shapes.id = shape_id
                    WHERE collection_id = ?1 GROUP BY label";
         let mut statement = self.connection().prepare_cached(sql)?;
         let uses = statement.query_map([collection], |row| {
