@@ -287,11 +287,7 @@ fn on_patches(input: &DiscoveryInput<'_>, offsets: &[usize]) -> Links {
 }
 
 /// Returns the number of labels whose best candidate has the highest value, and the candidates.
-fn estimate(
-    shapes: &Prepared<'_>,
-    criterion: &Criterion,
-    options: &DiscoveryOptions,
-) -> (usize, Vec<Vec<u32>>) {
+fn estimate(shapes: &Prepared<'_>, criterion: &Criterion, options: &DiscoveryOptions) -> Numbered {
     let valued = |k: usize| {
         let candidates = pool(shapes, criterion, k, options.seed);
         let judge = Judge::new(criterion, candidates, &shapes.area, k);
@@ -299,12 +295,15 @@ fn estimate(
     };
     let fewest = fewest_labels(&shapes.input.links).max(2);
     let counts = (fewest..=options.max_labels.max(fewest)).into_par_iter();
-    let valued: Vec<(f64, (usize, Vec<Vec<u32>>))> = counts.map(valued).collect();
+    let valued: Vec<(f64, Numbered)> = counts.map(valued).collect();
     let best = valued
         .into_iter()
         .reduce(|best, next| if next.0 > best.0 { next } else { best });
     best.map_or((2, Vec::new()), |(_, pool)| pool)
 }
+
+/// A number of labels, and labellings of all patches with as many.
+type Numbered = (usize, Vec<Vec<u32>>);
 
 /// The candidate labellings with one number of labels, each refined patch by patch, and their
 /// judge.
@@ -320,7 +319,7 @@ impl<'a> Candidates<'a> {
         shapes: &'a Prepared<'_>,
         criterion: &'a Criterion,
         patchwise: &Patchwise<'_>,
-        (k, candidates): (usize, Vec<Vec<u32>>),
+        (k, candidates): Numbered,
         seed: u64,
     ) -> Self {
         let refined_all = |labellings: &[Vec<u32>]| -> Vec<Vec<u32>> {
@@ -365,7 +364,7 @@ impl<'a> Candidates<'a> {
 fn choose(
     shapes: &Prepared<'_>,
     criterion: &Criterion,
-    pool: (usize, Vec<Vec<u32>>),
+    pool: Numbered,
     seed: u64,
     current: Option<(&[Vec<u32>], usize)>,
 ) -> Option<Discovery> {

@@ -41,8 +41,8 @@ impl Library {
     /// Returns the shape whose labelling by a person would help most: the one that brings the other
     /// shapes, each weighted by the uncertainty of its labels, nearest to a training shape (greedy
     /// facility location; Nemhauser, Wolsey and Fisher 1978), times the share of the collection's
-    /// area whose label it or a training shape shows. Without training shapes the former is largest
-    /// for the medoid. Compares at most a thousand signatures with each other.
+    /// area whose label it or a training shape shows. Without training shapes it is the medoid.
+    /// Compares at most a thousand signatures with each other.
     ///
     /// # Errors
     /// There is no such collection, or a person has labelled every shape of it.
@@ -115,11 +115,7 @@ impl Library {
         let mean = gains.iter().sum::<f64>() / n as f64;
         let percent = uncertainty[best] * 100.0;
         let reason = if n_corrected == 0 {
-            let shows = 100.0 * shown[best];
-            format!(
-                "nothing is labelled by hand yet, and it is central and shows labels of {shows:.0} \
-                 % of the area"
-            )
+            "nothing is labelled by hand yet, and it is the most central shape".to_owned()
         } else {
             format!(
                 "it is nearer to {n_nearest} of {n} shapes than any labelled by hand, and \
@@ -137,18 +133,14 @@ impl Library {
     }
 }
 
-/// Returns the labels that no training shape shows.
+/// Returns the labels that are kept because no training shape shows them; none before there is a
+/// training shape.
 fn unclaimed(collection: &Collection) -> Vec<LabelId> {
-    match collection.state().regime.supervision() {
-        Some(supervision) => supervision.discovered().kept.clone(),
-        None => {
-            let model = collection.label_model();
-            model.map_or_else(Vec::new, |m| m.labels.clone())
-        }
-    }
+    let supervision = collection.state().regime.supervision();
+    supervision.map_or_else(Vec::new, |s| s.discovered().kept.clone())
 }
 
-/// Labels that no training shape shows.
+/// Unclaimed labels.
 struct Unclaimed {
     /// Each label with its mean share of a shape's area.
     labels: BTreeMap<LabelId, f64>,
