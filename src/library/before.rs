@@ -1,7 +1,6 @@
 //! The state of a collection before a change by a person, as the catalog stores it to undo the
 //! change.
 
-use super::change::LinkEdit;
 use super::collection::{Collection, ModelState, State, StoredState};
 use super::error::Result;
 use super::rows::{damaged, from_json, to_json};
@@ -156,24 +155,10 @@ impl Before {
         found.cloned().map(LabelRow::from)
     }
 
-    /// Returns the edits that bring the links back, from those that are there. Links of shapes that
-    /// are not there any more, by `is_there`, stay away.
-    pub(super) fn link_edits(
-        &self,
-        now: &[LinkRow],
-        is_there: &dyn Fn(ShapeId) -> bool,
-    ) -> Vec<LinkEdit> {
-        let Some(before) = &self.links else {
-            return Vec::new();
-        };
-        let newer = now.iter().filter(|l| before.iter().all(|b| b.id != l.id));
-        let mut edits: Vec<LinkEdit> = newer.map(|l| LinkEdit::TakenBack { id: l.id }).collect();
-        let gone = before.iter().filter(|b| now.iter().all(|l| l.id != b.id));
-        let gone = gone.filter(|b| b.ends.iter().all(|e| is_there(ShapeId(e.shape))));
-        edits.extend(gone.map(|b| LinkEdit::Restored {
-            row: b.clone().into(),
-        }));
-        edits
+    /// Returns the links; `None` if the change does not concern them.
+    pub(super) fn stored_links(&self) -> Option<Vec<LinkRow>> {
+        let links = self.links.as_ref()?.iter();
+        Some(links.map(|l| l.clone().into()).collect())
     }
 
     /// Returns the model; `None` if there was none.
@@ -331,17 +316,7 @@ mod tests {
         };
         let decoded = Before::decode(&row).expect("decodes");
         assert_eq!(decoded, before);
-        let newer = LinkRow {
-            id: 6,
-            ..link.clone()
-        };
-        let edits = |is_there: bool| decoded.link_edits(&[newer.clone()], &|_| is_there);
-        let text = format!("{:?}", edits(true));
-        assert_eq!(
-            text,
-            format!("[TakenBack {{ id: 6 }}, Restored {{ row: {link:?} }}]")
-        );
-        assert_eq!(format!("{:?}", edits(false)), "[TakenBack { id: 6 }]");
+        assert_eq!(decoded.stored_links(), Some(vec![link]));
         row.before.truncate(20);
         assert!(Before::decode(&row).is_err());
     }

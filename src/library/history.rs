@@ -1,7 +1,7 @@
 //! Undoes the newest change that a person made to a collection.
 
 use super::before::{Before, Rest};
-use super::change::{Change, LabelEdit, commit_once};
+use super::change::{Change, LabelEdit, LinkEdit, commit_once};
 use super::collection::{Collection, State};
 use super::error::{LibraryError, Result};
 use super::event::EventKind;
@@ -12,7 +12,7 @@ use super::reason::Reason;
 use super::rows::{damaged, to_json};
 use super::sources::Sources;
 use super::types::RequestKey;
-use crate::store::{CorrectionRow, LabelsBefore, ReviewRow, ShapeId};
+use crate::store::{CorrectionRow, LabelsBefore, LinkRow, ReviewRow, ShapeId};
 use serde::{Deserialize, Serialize};
 
 /// The result of undoing a change.
@@ -110,7 +110,9 @@ fn undoing(
         });
     }
     let is_there = |shape: ShapeId| collection.position(shape).is_some();
-    change.links = before.link_edits(&sources.links(collection.id())?, &is_there);
+    if let Some(links) = before.stored_links() {
+        change.links = link_edits(links, &sources.links(collection.id())?, &is_there);
+    }
     let Some(rest) = &before.rest else {
         return Ok(change);
     };
@@ -141,6 +143,23 @@ fn undoing(
     Ok(change)
 }
 
+/// Returns the edits that bring links back to those `before`, from those `now`. Links of shapes that
+/// are not there any more stay away.
+fn link_edits(
+    before: Vec<LinkRow>,
+    now: &[LinkRow],
+    is_there: &dyn Fn(ShapeId) -> bool,
+) -> Vec<LinkEdit> {
+    let newer = now.iter().filter(|l| before.iter().all(|b| b.id != l.id));
+    let mut edits: Vec<LinkEdit> = newer.map(|l| LinkEdit::TakenBack { id: l.id }).collect();
+    let gone = before
+        .into_iter()
+        .filter(|b| now.iter().all(|l| l.id != b.id));
+    let gone = gone.filter(|b| b.ends.iter().all(|e| is_there(e.shape)));
+    edits.extend(gone.map(|row| LinkEdit::Restored { row }));
+    edits
+}
+
 /// Returns the labels that a change replaced, as new versions.
 fn restored(
     collection: &Collection,
@@ -168,4 +187,32 @@ fn restored(
         out.push(Relabelled::new(&known, labels, cause::UNDO));
     }
     Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::LinkEnd;
+
+    #[test]
+    fn links_come_back_as_they_were_unless_their_shapes_are_gone() {
+        let link = |id| LinkRow {
+            id,
+            kind: "same".into(),
+            ends: [1, 2].map(|shape| LinkEnd {
+                shape: ShapeId(shape),
+                part: 0,
+                polygons: vec![0],
+            }),
+            person: String::new(),
+            unix_ms: 0,
+        };
+        let edits = |is_there| {
+            let edits = link_edits(vec![link(3), link(4)], &[link(4), link(5)], &|_| is_there);
+            format!("{edits:?}")
+        };
+        let restored = format!("[TakenBack {{ id: 5 }}, Restored {{ row: {:?} }}]", link(3));
+        assert_eq!(edits(true), restored);
+        assert_eq!(edits(false), "[TakenBack { id: 5 }]");
+    }
 }
