@@ -143,8 +143,8 @@ fn undoing(
     Ok(change)
 }
 
-/// Returns the edits that bring links back to those `before`, from those `now`. Links of shapes that
-/// are not there any more stay away.
+/// Returns the edits that bring links back to those `before`, from those `now`. Links of shapes
+/// that are not there any more stay away.
 fn link_edits(
     before: Vec<LinkRow>,
     now: &[LinkRow],
