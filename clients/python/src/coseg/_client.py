@@ -696,8 +696,8 @@ class Collection:
         return self._link("differ", a, b, by)
 
     def _link(self, kind: str, a: tuple[str, int], b: tuple[str, int], by: str) -> t.Linked:
-        ends = {"a": wire.part_of_shape(a), "b": wire.part_of_shape(b)}
-        reply, _ = self._call("link_parts", kind=wire.link_kind(kind), by=by, **ends)
+        one, other = wire.part_of_shape(a), wire.part_of_shape(b)
+        reply, _ = self._call("link_parts", kind=wire.link_kind(kind), a=one, b=other, by=by)
         return wire.linked(reply)
 
     def unlink(self, id: int) -> t.Unlinked:
