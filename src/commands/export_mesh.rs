@@ -112,6 +112,8 @@ mod tests {
             colour_rgb: 0,
             merged_into: None,
             n_shapes: 1,
+            area_share: 1.0,
+            unclaimed: false,
         };
         let mut own = OwnMaterials::beside(&styles(&[info]));
         let shape = |materials: &[(&str, u8)]| Attributes {
