@@ -173,7 +173,7 @@ fn with_mesh(
         }
         (ExportFormat::Obj, format) => {
             let attributes = Attributes::of(bytes, format)?;
-            let names = own.names(&attributes);
+            let names = own.names(&attributes.materials);
             let own = (materials == Materials::Own).then_some(names.as_slice());
             let of = (&attributes, own);
             let text = obj_with(vertices, &polygons, labelling, MATERIALS, of);

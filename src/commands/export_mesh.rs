@@ -1,7 +1,7 @@
 //! What exported meshes show of labels: names and colours.
 
 use coseg::ipc::wire::LabelInfo;
-use coseg::mesh::write::{Attributes, LabelStyle, mtl, mtl_entry};
+use coseg::mesh::write::{LabelStyle, OwnMaterial, mtl, mtl_entry};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The colour of a label; grey without one.
@@ -50,9 +50,9 @@ impl OwnMaterials {
 
     /// Names in the file for the materials of a shape. Materials of two shapes with one name share
     /// it if they have the same colour, else the second one gets a number.
-    pub(crate) fn names(&mut self, attributes: &Attributes) -> Vec<String> {
+    pub(crate) fn names(&mut self, materials: &[OwnMaterial]) -> Vec<String> {
         let mut own = BTreeSet::new();
-        let named = attributes.materials.iter().map(|material| {
+        let named = materials.iter().map(|material| {
             let name = material.name.replace(char::is_whitespace, "_");
             let colour = material.colour.unwrap_or([255; 3]);
             let mut candidates = std::iter::once(name.clone())
@@ -83,7 +83,7 @@ impl OwnMaterials {
 
 #[cfg(test)]
 mod tests {
-    use super::{Attributes, LabelInfo, OwnMaterials, colour, styles};
+    use super::{LabelInfo, OwnMaterials, colour, styles};
     use coseg::mesh::write::OwnMaterial;
 
     #[test]
@@ -116,15 +116,12 @@ mod tests {
             unclaimed: false,
         };
         let mut own = OwnMaterials::beside(&styles(&[info]));
-        let shape = |materials: &[(&str, u8)]| Attributes {
-            materials: materials
-                .iter()
-                .map(|(name, red)| OwnMaterial {
-                    name: (*name).to_owned(),
-                    colour: Some([*red, 0, 0]),
-                })
-                .collect(),
-            ..Attributes::default()
+        let shape = |materials: &[(&str, u8)]| -> Vec<OwnMaterial> {
+            let materials = materials.iter().map(|(name, red)| OwnMaterial {
+                name: (*name).to_owned(),
+                colour: Some([*red, 0, 0]),
+            });
+            materials.collect()
         };
         assert_eq!(
             own.names(&shape(&[("dark oak", 1), ("leg", 2)])),
