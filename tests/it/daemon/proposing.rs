@@ -133,7 +133,7 @@ fn a_proposal_is_chosen_undone_and_still_there_after_a_kill() {
     let distinct: BTreeSet<_> = all.iter().collect();
     assert_eq!(distinct.len(), all.len());
 
-    let chosen = other(&found).clone();
+    let chosen = *other(&found);
     assert!(chosen.differs > 0.05 && !chosen.in_force, "{chosen:?}");
     let done = choose(client, chosen.n, &found.set);
     assert_eq!(done.n_labels, chosen.n_labels);
@@ -195,7 +195,7 @@ fn added_shapes_get_new_proposals_and_do_not_overrule_the_choice() {
     let chairs = chairs(8);
     add_chairs(client, &chairs[..5]);
     let found = made(client);
-    let chosen = other(&found).clone();
+    let chosen = *other(&found);
     choose(client, chosen.n, &found.set);
     let sequence = events_since(client, "c").last().unwrap().sequence;
     add_chairs(client, &chairs[5..]);
