@@ -80,14 +80,18 @@ impl Strips {
     /// Returns the share of faces whose label is right up to one renaming; all strips have the same
     /// parts.
     pub(super) fn right(&self, labels: &[Vec<u32>]) -> f64 {
-        let k = 1 + self.truth.iter().max().map_or(0, |t| *t as usize);
-        let mut cost = vec![0.0; k * k];
+        let count = |max: Option<&u32>| 1 + max.map_or(0, |t| *t as usize);
+        let (n, k) = (
+            count(labels.iter().flatten().max()),
+            count(self.truth.iter().max()),
+        );
+        let mut cost = vec![0.0; n * k];
         for labels in labels {
             for (l, t) in labels.iter().zip(&self.truth) {
                 cost[*l as usize * k + *t as usize] -= 1.0;
             }
         }
-        let matched = crate::linalg::assignment::assignment(&cost, k, k);
+        let matched = crate::linalg::assignment::assignment(&cost, n, k);
         let pairs = matched.iter().enumerate();
         let right: f64 = pairs.filter_map(|(l, t)| t.map(|t| -cost[l * k + t])).sum();
         right / (labels.len() * self.truth.len()) as f64

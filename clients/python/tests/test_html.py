@@ -51,7 +51,7 @@ def test_a_spectrum_is_its_curve() -> None:
 
 def test_names_of_others_are_no_markup(chairs: coseg.Collection) -> None:
     assert "&lt;b&gt;" in fmap(np.eye(2, dtype=np.float32), "<b>")._repr_html_()
-    label = t.Label(1, "<script>", 0xFF8000, None, 3)
+    label = t.Label(1, "<script>", 0xFF8000, None, 3, 0.5, False)
     info = chairs.info()
     shown = t.CollectionInfo(**{**vars(info), "labels": (label,)})._repr_html_()
     assert "&lt;script&gt;" in shown and "<script" not in shown and "#ff8000" in shown
