@@ -8,7 +8,7 @@ cd "$(dirname "$0")/../.."
 coseg=$(realpath "${1:-target/release/coseg}")
 here=$PWD/tests/formats
 work=$(mktemp -d)
-trap '[ -z "${daemon:-}" ] || kill "$daemon" 2>/dev/null || true; rm -rf "$work"' EXIT
+trap '[ -z "${daemon:-}" ] || { kill "$daemon"; wait "$daemon"; } 2>/dev/null || true; rm -rf "$work"' EXIT
 
 python3 -m venv "$work/venv"
 "$work/venv/bin/pip" install -q numpy trimesh plyfile usd-core pillow
