@@ -59,6 +59,17 @@ pub struct CorrectionOptions<'a> {
     pub closed: Option<bool>,
 }
 
+/// What a person says about the labels of the collection by labelling faces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Said {
+    /// Nothing: the faces may be those that were wrong.
+    Nothing,
+    /// The faces are a sample of all, chosen by us.
+    Sample,
+    /// Whether there are no labels but those that persons used.
+    Closed(bool),
+}
+
 /// What a correction did.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Corrected {
@@ -177,7 +188,8 @@ impl Library {
                 return from_reply(&reply);
             }
             let id = self.shape_row(collection, shape)?.1.id;
-            let mut corrects = corrects(in_memory, &self.store, id, correction, options.closed)?;
+            let said = options.closed.map_or(Said::Nothing, Said::Closed);
+            let mut corrects = corrects(in_memory, &self.store, id, correction, said)?;
             let review = review_row(ReviewState::Corrected, options.by);
             corrects.change.reviews.push((id, Some(review)));
             let reply = corrects.commit(&self.store, in_memory, &request, |done| to_json(&done))?;
@@ -217,14 +229,13 @@ impl Corrects {
     }
 }
 
-/// Returns the change that corrects one shape. `closed`: whether there are no labels but those that
-/// persons used; `None`: as before.
+/// Returns the change that corrects one shape.
 pub(super) fn corrects(
     collection: &Collection,
     sources: &dyn Sources,
     id: ShapeId,
     correction: &Correction,
-    closed: Option<bool>,
+    said: Said,
 ) -> Result<Corrects> {
     let known = sources.known(id)?;
     let view = known.view();
@@ -238,11 +249,12 @@ pub(super) fn corrects(
     }
     let before = used_labels(collection, sources, None)?;
     let mut after = used_labels(collection, sources, Some(Instead::Pinned(&known, &pins)))?;
-    match closed {
-        Some(true) => after.vocabulary = Vocabulary::Closed,
-        Some(false) => after.vocabulary = after.shown,
-        None => {}
-    }
+    after.vocabulary = match said {
+        Said::Nothing => after.vocabulary,
+        Said::Sample => after.sampled(),
+        Said::Closed(true) => Vocabulary::Closed,
+        Said::Closed(false) => after.shown,
+    };
     if after.labels.len() > MAX_LABELS {
         let message = format!(
             "collection {:?} would have {} labels, the limit is {MAX_LABELS}",

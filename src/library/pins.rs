@@ -22,6 +22,19 @@ pub(super) struct UsedLabels {
     pub(super) vocabulary: Vocabulary,
     /// The vocabulary if no person had said that there are no others.
     pub(super) shown: Vocabulary,
+    /// Area that persons labelled, in shapes: that of a shape is 1.
+    area: f64,
+}
+
+impl UsedLabels {
+    /// Returns the vocabulary if the labelled faces are a sample of the collection: then they may
+    /// show its labels together, although none of the shapes is labelled whole.
+    pub(super) fn sampled(&self) -> Vocabulary {
+        match self.vocabulary {
+            Vocabulary::Open if self.area >= WHOLE => Vocabulary::Covered,
+            vocabulary => vocabulary,
+        }
+    }
 }
 
 /// A stored shape whose pins are about to change.
@@ -46,9 +59,12 @@ pub(super) fn used_labels(
     };
     let mut labels = BTreeSet::new();
     let mut shown = Vocabulary::Open;
+    let mut area = 0.0;
     let mut take = |view: &DescriptionView<'_>, pins: &[i32]| {
         labels.extend(pins.iter().filter_map(|p| u32::try_from(*p).ok()));
-        if pinned_share(view, pins) >= WHOLE {
+        let share = pinned_share(view, pins);
+        area += share;
+        if share >= WHOLE {
             shown = Vocabulary::Covered;
         }
     };
@@ -65,12 +81,14 @@ pub(super) fn used_labels(
     let supervision = collection.state().regime.supervision();
     let vocabulary = match supervision.map(Supervision::vocabulary) {
         Some(Vocabulary::Closed) => Vocabulary::Closed,
+        Some(Vocabulary::Covered) if area >= WHOLE => Vocabulary::Covered,
         _ => shown,
     };
     Ok(UsedLabels {
         labels,
         vocabulary,
         shown,
+        area,
     })
 }
 

@@ -3,7 +3,7 @@
 
 use super::change::{LabelEdit, Undoable};
 use super::collection::Collection;
-use super::correct::{Corrected, Correction, corrects};
+use super::correct::{Corrected, Correction, Said, corrects};
 use super::error::{LibraryError, Result};
 use super::facade::Library;
 use super::names::check_name;
@@ -240,7 +240,7 @@ impl Library {
                 }
             };
             let correction = Correction::Faces { faces, label };
-            let mut corrects = corrects(in_memory, &self.store, id, &correction, None)?;
+            let mut corrects = corrects(in_memory, &self.store, id, &correction, Said::Sample)?;
             let change = &mut corrects.change;
             change.undoable = Some(Undoable::Answer {
                 shape: shape.to_owned(),

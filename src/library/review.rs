@@ -1,7 +1,7 @@
 //! Stores a person's verdict on a shape, and reads it back.
 
 use super::change::{Change, Undoable, commit_once};
-use super::correct::{Corrected, Correction, corrects};
+use super::correct::{Corrected, Correction, Said, corrects};
 use super::error::Result;
 use super::facade::Library;
 use super::once::{Request, answered, from_reply};
@@ -33,8 +33,8 @@ impl Library {
             }
             let id = self.shape_row(collection, shape)?.1.id;
             let labels = self.store.known(id)?.labels.polygon_labels;
-            let mut corrects =
-                corrects(in_memory, &self.store, id, &Correction::Whole(labels), None)?;
+            let labels = Correction::Whole(labels);
+            let mut corrects = corrects(in_memory, &self.store, id, &labels, Said::Nothing)?;
             corrects.change.undoable = Some(Undoable::Approve {
                 shape: shape.to_owned(),
             });
