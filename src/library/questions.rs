@@ -11,7 +11,7 @@ use super::once::{Request, answered, from_reply};
 use super::pins::pins_of;
 use super::reason::Reason;
 use super::review_rows::{check_reviewer, review_row};
-use super::rows::{label_colour, to_json};
+use super::rows::{label_colour, resolved, to_json};
 use super::sources::{Known, Sources};
 use super::types::{LabelId, RequestKey};
 use super::verdict::ReviewState;
@@ -440,7 +440,8 @@ fn offered(
             Some(label) => Some(*label),
             None => discovered.get(class - used.len()).copied(),
         };
-        let row = label.and_then(|label| resolved(labels, label));
+        let row = label.map(|label| resolved(labels, label));
+        let row = row.and_then(|id| labels.iter().find(|l| l.id == id));
         let Some(row) = row else { continue };
         match out.iter_mut().find(|o| o.label == row.id) {
             Some(same) => same.probability += probability,
@@ -458,18 +459,4 @@ fn offered(
             .then(a.label.cmp(&b.label))
     });
     out
-}
-
-/// Returns the label to which an id resolves after merges.
-fn resolved(labels: &[LabelRow], id: LabelId) -> Option<&LabelRow> {
-    let find = |id: LabelId| labels.iter().find(|l| l.id == id);
-    let mut row = find(id)?;
-    // A chain has at most as many links as there are labels.
-    for _ in 0..labels.len() {
-        match row.merged_into {
-            Some(next) => row = find(next)?,
-            None => break,
-        }
-    }
-    Some(row)
 }

@@ -1,10 +1,11 @@
 //! Converts text in the catalog to domain values and back.
 
 use super::error::{LibraryError, Result};
+use super::types::LabelId;
 use crate::fmap::{Confidence, Quality, confidence};
 use crate::mesh::{CleanReport, Format};
 use crate::operators::Operator;
-use crate::store::{MapRow, StoreError};
+use crate::store::{LabelRow, MapRow, StoreError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -23,6 +24,20 @@ pub(super) fn damaged(location: &str, message: &str) -> LibraryError {
         message: message.to_string(),
     }
     .into()
+}
+
+/// Returns the label to which an id resolves after merges.
+pub(super) fn resolved(rows: &[LabelRow], id: LabelId) -> LabelId {
+    let into = |id: LabelId| rows.iter().find(|l| l.id == id).and_then(|l| l.merged_into);
+    let mut id = id;
+    // A chain has at most as many links as there are labels.
+    for _ in 0..rows.len() {
+        match into(id) {
+            Some(next) => id = next,
+            None => break,
+        }
+    }
+    id
 }
 
 /// Converts a report of cleaning to JSON.

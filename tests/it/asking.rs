@@ -1,14 +1,10 @@
 //! A person answers questions about parts and gives verdicts on shapes.
 
-use crate::pipeline::{COLLECTION, SMALL, all_labels, library, stream};
+use crate::pipeline::{COLLECTION, SMALL, all_labels, library, propagate, stream};
 use coseg::Library;
 use coseg::library::{Answer, Correction, PartQuestion, Reason, ReviewState, Up};
 use coseg::synth::{Family, Labelled, family};
 use std::collections::{BTreeMap, BTreeSet};
-
-fn propagate(library: &Library) {
-    while library.relabel_next(Some(COLLECTION)).unwrap() {}
-}
 
 fn ask(library: &Library) -> PartQuestion {
     library.next_question(COLLECTION, false).unwrap()
@@ -125,6 +121,37 @@ fn a_new_name_is_that_of_the_discovered_label_unless_a_person_used_it() {
     let row = labels.iter().find(|l| l.id == label).unwrap();
     assert_eq!(row.name, None);
     assert_eq!(all_labels(&library), discovered);
+}
+
+#[test]
+fn answers_on_many_shapes_together_leave_no_shown_label_unclaimed() {
+    let shapes = family(Family::Pliers, 41, 6, &SMALL);
+    let (_folder, library) = library(3, Up::Unknown);
+    stream(&library, &shapes);
+    let discovered: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+    assert_eq!(discovered.len(), 3);
+    // To this person two of the three parts are one.
+    let mut ids = BTreeSet::new();
+    let mut unclaimed = Vec::new();
+    for _ in 0..30 {
+        let question = ask(&library);
+        let name = match truth(&shapes, &question) {
+            0 => "jaw",
+            _ => "grip",
+        };
+        let label = answer(&library, &question, &Answer::Named(name.into())).unwrap();
+        ids.insert(label as i32);
+        propagate(&library);
+        let now: BTreeSet<i32> = all_labels(&library).into_values().flatten().collect();
+        unclaimed.push(now.difference(&ids).count());
+    }
+    assert_eq!(ids.len(), 2);
+    assert_eq!(
+        unclaimed.first(),
+        Some(&2),
+        "one of three labels has a name"
+    );
+    assert_eq!(unclaimed.last(), Some(&0), "{unclaimed:?}");
 }
 
 #[test]

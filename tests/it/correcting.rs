@@ -1,6 +1,6 @@
 //! Tests corrections: labels are pinned, propagated to all other shapes, and can be undone.
 
-use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, stream};
+use crate::pipeline::{COLLECTION, SMALL, all_labels, file, library, propagate, stream};
 use coseg::Library;
 use coseg::library::{
     Correction, CorrectionOptions, EventKind, LibraryError, MAX_MAPS, Reason, RequestKey, Up,
@@ -19,10 +19,6 @@ fn correct(library: &Library, shape: &Labelled) {
     library
         .correct(COLLECTION, &shape.name, &correction, None)
         .unwrap();
-}
-
-fn propagate(library: &Library) {
-    while library.relabel_next(Some(COLLECTION)).unwrap() {}
 }
 
 /// Share of the faces of the other shapes that have the known label, by id.

@@ -1,17 +1,13 @@
 //! A person links parts: they get the same label, or different ones, whether labels are discovered
 //! or follow from corrections.
 
-use crate::pipeline::{COLLECTION, SMALL, all_labels, library, stream};
+use crate::pipeline::{COLLECTION, SMALL, all_labels, library, propagate, stream};
 use coseg::Library;
 use coseg::library::{
     Answer, Code, Correction, EventKind, Failure, Link, LinkChanged, LinkKind, PartName, Reason, Up,
 };
 use coseg::synth::{Family, Labelled, family};
 use std::collections::BTreeMap;
-
-fn propagate(library: &Library) {
-    while library.relabel_next(Some(COLLECTION)).unwrap() {}
-}
 
 fn part(shape: &str, part: u32) -> PartName {
     let shape = shape.to_owned();

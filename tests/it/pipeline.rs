@@ -57,6 +57,11 @@ pub(crate) fn stream(library: &Library, shapes: &[Labelled]) {
             placed.n_relabelled
         );
     }
+    propagate(library);
+}
+
+/// Relabels until no shape is stale.
+pub(crate) fn propagate(library: &Library) {
     while library.relabel_next(Some(COLLECTION)).unwrap() {}
 }
 

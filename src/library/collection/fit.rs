@@ -5,7 +5,7 @@
 //! few shapes at a time. Last, the model is fitted to all of them at once.
 
 use super::discovered::{MAX_MAPS, MAX_REPRESENTATIVES};
-use super::kept::{Kept, resolved};
+use super::kept::Kept;
 use super::state::{Phase, Supervision};
 use super::supervised::{propagated, with};
 use super::up::UpFound;
@@ -16,7 +16,7 @@ use crate::library::error::Result;
 use crate::library::labelling::{Relabelled, cause};
 use crate::library::linked::{Linked, linked_shapes};
 use crate::library::pins::{pinned_faces, pinned_share, pins_of, used_labels};
-use crate::library::rows::damaged;
+use crate::library::rows::{damaged, resolved};
 use crate::library::sources::{Known, Sources};
 use crate::library::types::LabelId;
 use crate::library::voting::{IncomingMap, PreparedShape, new_map};

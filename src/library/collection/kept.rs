@@ -4,6 +4,7 @@
 use super::Collection;
 use super::state::{Supervision, Vocabulary};
 use crate::library::change::LabelEdit;
+use crate::library::rows::resolved;
 use crate::library::types::LabelId;
 use crate::pipeline::{DiscoveredLabels, LabelChange};
 use crate::store::LabelRow;
@@ -41,6 +42,9 @@ impl Kept {
                 continue;
             }
             let taken = given.contains(&id);
+            if taken && is_named(rows, id) {
+                continue;
+            }
             let stays = if taken {
                 let new = collection.row().next_label + kept.renumbered.len() as u32;
                 kept.renumbered.push((at, id, new));
@@ -93,16 +97,7 @@ impl Kept {
     }
 }
 
-/// Returns the label to which an id resolves after merges.
-pub(super) fn resolved(rows: &[LabelRow], id: LabelId) -> LabelId {
-    let into = |id: LabelId| rows.iter().find(|l| l.id == id).and_then(|l| l.merged_into);
-    let mut id = id;
-    // A chain has at most as many links as there are labels.
-    for _ in 0..rows.len() {
-        match into(id) {
-            Some(next) => id = next,
-            None => break,
-        }
-    }
-    id
+/// Returns whether a person named the label with this id.
+fn is_named(rows: &[LabelRow], id: LabelId) -> bool {
+    rows.iter().any(|l| l.id == id && l.name.is_some())
 }
