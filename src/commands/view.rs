@@ -122,6 +122,7 @@ fn portraits(
         collection: collection.to_owned(),
         shapes: shapes.to_vec(),
         detail: detail.into(),
+        proposal: 0,
     };
     let (reply, frames) = call!(session.client, GetPortraits(request), frames)?;
     let pack = FrameReader::new(&frames).file(reply.pack.as_ref(), "pack");

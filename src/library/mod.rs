@@ -54,6 +54,7 @@ mod pins;
 mod placing;
 mod points;
 mod proposals;
+mod proposed;
 mod questions;
 mod read;
 mod reason;

@@ -1,4 +1,4 @@
-//! Makes proposals in the background, and lists them.
+//! Makes proposals in the background.
 //!
 //! A step finds the candidates with one number of labels and stores them; the last one picks the
 //! proposals. Steps read the shapes without holding the collection, so nothing that a person asks
@@ -11,18 +11,13 @@ use super::lookup::require_collection;
 use super::reason::Reason;
 use super::rows::{damaged, from_json, to_json};
 use super::sources::{Known, Sources};
-use crate::labels::{Candidate, PROPOSED_LABELS, Proposal, agreement};
+use crate::labels::{Candidate, PROPOSED_LABELS, Proposal};
 use crate::pipeline::{DescriptionView, proposal_candidates, proposals};
-use crate::segmentation::Surface;
-use crate::store::{
-    CandidatesRow, CollectionId, CollectionRow, Digest, ProposalRow, Reader, ShapeId,
-};
+use crate::store::{CandidatesRow, CollectionId, CollectionRow, Digest, ProposalRow, Reader};
 use serde::{Deserialize, Serialize};
 
 /// Number of shapes from which on proposals are made: on fewer, too little recurs.
 pub const MIN_PROPOSED_SHAPES: u64 = 3;
-/// Difference below which the labels in force count as one of the proposals.
-const SAME: f64 = 0.01;
 
 /// The proposals of a collection.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,6 +33,8 @@ pub struct Proposals {
     pub n_done: u32,
     /// Number of shapes that are divided.
     pub n_shapes: u64,
+    /// Names of those that are still there, in the order of their arrival.
+    pub shapes: Vec<String>,
 }
 
 /// A division of some shapes of a collection into labels.
@@ -87,10 +84,10 @@ pub(super) struct StoredProposals {
 
 /// The key of the proposals that a collection should have: the newest ordinal when clustering was
 /// due, and the up axis.
-type Wanted = (u64, (String, Option<[f64; 3]>));
+pub(super) type Wanted = (u64, (String, Option<[f64; 3]>));
 
 /// Returns the key of the proposals that a collection should have; `None` if none are made.
-fn wanted(reader: &Reader<'_>, row: &CollectionRow) -> Result<Option<Wanted>> {
+pub(super) fn wanted(reader: &Reader<'_>, row: &CollectionRow) -> Result<Option<Wanted>> {
     let state = State::of(row)?;
     let is_discovering = state.regime == Regime::Discovering;
     if !is_discovering || row.epoch == 0 || reader.n_shapes(row.id)? < MIN_PROPOSED_SHAPES {
@@ -132,7 +129,8 @@ pub(super) fn stored(reader: &Reader<'_>, id: CollectionId) -> Result<Option<Sto
 const SET_CHARS: usize = 16;
 
 impl Basis {
-    fn is_wanted(&self, wanted: &Wanted) -> bool {
+    /// Returns whether proposals for these shapes are those that a collection should have.
+    pub(super) fn is_wanted(&self, wanted: &Wanted) -> bool {
         (self.clustered, &self.up) == (wanted.0, &wanted.1)
     }
 }
@@ -268,120 +266,6 @@ impl Library {
             }
             Ok(is_there)
         })
-    }
-
-    /// Returns the proposals of a collection: those for its present labels or, while new ones are
-    /// made, the previous ones.
-    ///
-    /// # Errors
-    /// There is no such collection, or nothing is proposed for it; the error says why.
-    pub fn proposals(&self, collection: &str) -> Result<Proposals> {
-        let (row, wanted, stored, candidates) = self.store.catalog().read(|r| -> Result<_> {
-            let row = require_collection(r, collection)?;
-            let (wanted, stored) = (wanted(r, &row)?, stored(r, row.id)?);
-            let candidates = r.candidates(row.id)?;
-            Ok((row, wanted, stored, candidates))
-        })?;
-        let lacks = match (&wanted, &stored) {
-            (Some(wanted), Some(stored)) => !stored.basis.is_wanted(wanted),
-            (wanted, _) => wanted.is_some(),
-        };
-        let (mut n_steps, mut n_done) = (0, 0);
-        if lacks {
-            n_steps = PROPOSED_LABELS.count() as u32 + 1;
-            let of = |c: &&CandidatesRow| {
-                let basis = from_json::<Basis>(&c.basis, "candidates");
-                let key = basis.map(|b| (b.clustered, b.up)).ok();
-                key == wanted
-            };
-            n_done = candidates.iter().filter(of).count() as u32;
-        }
-        let Some(stored) = stored else {
-            if !lacks {
-                return Err(nothing_proposed(&row));
-            }
-            return Ok(Proposals {
-                proposals: Vec::new(),
-                set: String::new(),
-                n_steps,
-                n_done,
-                n_shapes: 0,
-            });
-        };
-        Ok(Proposals {
-            proposals: self.compared(&stored)?,
-            n_steps,
-            n_done,
-            n_shapes: stored.basis.shapes.len() as u64,
-            set: stored.set,
-        })
-    }
-
-    /// Compares proposals with the labels in force, on the shapes that are still there.
-    fn compared(&self, stored: &StoredProposals) -> Result<Vec<ProposalInfo>> {
-        let (mut in_force, mut area, mut is_kept) = (Vec::new(), Vec::new(), Vec::new());
-        for (id, n_faces) in stored.basis.shapes.iter().zip(&stored.n_faces) {
-            let known = self.divided_shape(ShapeId(*id), *n_faces)?;
-            is_kept.push(known.is_some());
-            if let Some(known) = known {
-                in_force.extend(known.labels.proxy_labels.iter().map(|l| *l as u32));
-                area.extend(Surface::new(&known.view().mesh()).area);
-            }
-        }
-        let differs = |row: &ProposalRow| {
-            let labels = stored.labels(row).into_iter().zip(&is_kept);
-            let labels: Vec<u32> = labels.filter(|l| *l.1).flat_map(|l| l.0).collect();
-            1.0 - agreement(&labels, &in_force, &area)
-        };
-        let differs: Vec<f64> = stored.rows.iter().map(differs).collect();
-        let least = differs.iter().copied().fold(SAME, f64::min);
-        let nearest = differs.iter().position(|d| *d <= least && *d < SAME);
-        let rows = stored.rows.iter().zip(differs).enumerate();
-        let info = |(at, (row, differs)): (usize, (&ProposalRow, f64))| ProposalInfo {
-            n: row.n,
-            n_labels: row.n_labels,
-            value: row.value,
-            in_force: Some(at) == nearest,
-            differs,
-        };
-        Ok(rows.map(info).collect())
-    }
-
-    /// Returns a shape that proposals divide, unless it was removed or described again.
-    pub(super) fn divided_shape(&self, id: ShapeId, n_faces: u32) -> Result<Option<Known>> {
-        if self.store.version(id)? == 0 {
-            return Ok(None);
-        }
-        let known = self.store.known(id)?;
-        let is_same = known.view().faces.len() == n_faces as usize;
-        Ok(is_same.then_some(known))
-    }
-
-    /// Returns the labels of one proposal on the shapes that it divides, in the order of their
-    /// arrival.
-    ///
-    /// # Errors
-    /// There is no such collection or proposal.
-    pub fn proposed_labels(&self, collection: &str, n: u32) -> Result<Vec<ProposedLabels>> {
-        let (row, stored) = self.store.catalog().read(|r| -> Result<_> {
-            let row = require_collection(r, collection)?;
-            let stored = stored(r, row.id)?;
-            Ok((row, stored))
-        })?;
-        let stored = stored.ok_or_else(|| nothing_proposed(&row))?;
-        let labels = stored.labels(stored.find(collection, n)?);
-        let mut found = Vec::new();
-        let shapes = stored.basis.shapes.iter().zip(&stored.n_faces);
-        for ((id, n_faces), labels) in shapes.zip(labels) {
-            if let Some(known) = self.divided_shape(ShapeId(*id), *n_faces)? {
-                let of_polygon = known.view().face_map.iter();
-                let labels = of_polygon.map(|f| labels[*f as usize] as i32).collect();
-                let shape = known.row.name.clone();
-                found.push((known.row.ordinal, ProposedLabels { shape, labels }));
-            }
-        }
-        found.sort_by_key(|f| f.0);
-        Ok(found.into_iter().map(|f| f.1).collect())
     }
 }
 

@@ -12,7 +12,7 @@ const FRAME: &str = include_str!("page/page.html");
 /// The viewer's styles.
 pub const STYLE: &str = include_str!("page/style.css");
 /// The viewer's scripts, in the order in which they use each other.
-const SCRIPTS: [&str; 25] = [
+const SCRIPTS: [&str; 27] = [
     include_str!("page/address.js"),
     include_str!("page/settings.js"),
     include_str!("page/data.js"),
@@ -30,6 +30,8 @@ const SCRIPTS: [&str; 25] = [
     include_str!("page/pointer.js"),
     include_str!("page/painter.js"),
     include_str!("page/ask.js"),
+    include_str!("page/proposals.js"),
+    include_str!("page/links.js"),
     include_str!("page/changes.js"),
     include_str!("page/verdicts.js"),
     include_str!("page/actions.js"),

@@ -177,6 +177,66 @@ fn only_the_page_itself_may_change_anything() {
 }
 
 #[test]
+fn a_page_lists_chooses_and_links() {
+    let home = Home::new();
+    let (daemon, address) = served(&home, &[]);
+    fill(&daemon);
+    let own = format!("host: {address}\r\nx-coseg: 1\r\n");
+    let post = |path: &str, body: &str| {
+        let (status, _, reply) = exchange(address, &format!("POST /api/{path}"), &own, body);
+        let reply: serde_json::Value = serde_json::from_slice(&reply).unwrap();
+        (status, reply)
+    };
+    let read = |path: &str| -> serde_json::Value {
+        let (status, text) = get(address, path);
+        assert_eq!(status, 200, "{text}");
+        serde_json::from_str(&text).unwrap()
+    };
+    // Why there are no proposals is an answer, too.
+    let none = read("/api/proposals?collection=skittles");
+    assert_eq!(none["proposals"], serde_json::json!([]));
+    let why = none["why"].as_str().unwrap();
+    assert!(why.contains("from 3 shapes on"), "{why}");
+    let (status, refusal) = post("choose", r#"{"collection":"skittles","n":1,"set":""}"#);
+    assert_eq!(
+        (status, &refusal["error"]["reason"]),
+        (409, &"NO_PROPOSALS".into())
+    );
+    let ends = r#""a":{"shape":"a","part":0},"b":{"shape":"b","part":0}"#;
+    let link = |kind: &str| {
+        let body = format!(r#"{{"collection":"skittles","kind":"{kind}",{ends},"by":"Ada"}}"#);
+        post("link", &body)
+    };
+    let (status, refusal) = link("equal");
+    let message = refusal["error"]["message"].as_str().unwrap();
+    assert_eq!(
+        (status, message),
+        (400, "kind is \"equal\", not same or differ")
+    );
+    let (status, made) = link("same");
+    assert_eq!((status, &made["changed"]), (200, &true.into()), "{made}");
+    assert_eq!(link("same").1["changed"], false, "the same link is there");
+    let (status, refusal) = link("differ");
+    let message = refusal["error"]["message"].as_str().unwrap();
+    assert_eq!(status, 409);
+    assert!(
+        message.contains("a:0 has the label of b:0 (link"),
+        "{message}"
+    );
+    let listed = read("/api/links?collection=skittles");
+    let found = &listed["links"][0];
+    assert_eq!(
+        (&found["kind"], &found["by"], &found["id"]),
+        (&"same".into(), &"Ada".into(), &made["link"]["id"])
+    );
+    let unlink = format!(r#"{{"collection":"skittles","id":{}}}"#, found["id"]);
+    assert_eq!(post("unlink", &unlink).0, 200);
+    assert_eq!(post("unlink", &unlink).0, 404);
+    let listed = read("/api/links?collection=skittles");
+    assert_eq!(listed["links"], serde_json::json!([]));
+}
+
+#[test]
 fn the_viewer_is_served_with_all_it_needs() {
     let home = Home::new();
     let (daemon, address) = served(&home, &[("COSEG__HTTP__EDIT", "false")]);

@@ -29,6 +29,8 @@ cd "$(dirname "$0")/../.."
 "$coseg" add "$work/fallen" --collection fallen --parts 4 --up -x --timeout 60 >/dev/null 2>"$work/warned"
 grep -q 'collections set fallen --up +y' "$work/warned" ||
     { cat "$work/warned" >&2; fail "no warning of the up axis" 1; }
+"$coseg" synth chair --count 2 --faces 1000 --out "$work/pair" >/dev/null
+"$coseg" add "$work/pair" --collection pair --parts 3 --timeout 60 >/dev/null
 "$coseg" view chairs -o "$work/chairs.html" --timeout 60
 
 (cd "$work" && node viewer.mjs all "$url" "$out" "$work/chairs.html")

@@ -14,6 +14,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 import { accessTests, violations } from "./access.mjs";
+import { choiceTests } from "./choices.mjs";
 import { labelTests } from "./labels.mjs";
 import { Tests, colours, coseg, launch, mode, opener, select } from "./page.mjs";
 import { paintTests } from "./paint.mjs";
@@ -239,6 +240,7 @@ if (what === "many") {
   });
 
   const kit = { test, open, coseg, shot, url, file: pathToFileURL(file).href, names };
+  await choiceTests(kit);
   await labelTests(kit);
   await verdictTests(kit);
   await paintTests(kit);

@@ -272,14 +272,17 @@ export class Collection {
   }
 
   /**
-   * At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes.
+   * At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes. With
+   * the number of a proposal, the proxy has its classes in place of the labels.
    */
   async portraits(
     names: readonly string[],
     detail: "proxy" | "surface" | "functions" = "proxy",
+    options: { proposal?: number } = {},
   ): Promise<Uint8Array> {
     const wanted = PortraitDetail[detail.toUpperCase() as keyof typeof PortraitDetail];
-    const request = { collection: this.name, shapes: [...names], detail: wanted };
+    const { proposal = 0 } = options;
+    const request = { collection: this.name, shapes: [...names], detail: wanted, proposal };
     const [reply, raw] = await this.library.call("getPortraits", request);
     return raw.file(reply.pack);
   }

@@ -1,8 +1,9 @@
 //! Turns the viewer's requests into those that any client could send, and the replies into JSON or
 //! packs of arrays.
 
+use super::choices;
+use super::exchange::{Answer, Found, Query, json_of, json_page, parsed, request};
 use super::hands::{Reserved, full};
-use super::page::unexpected;
 use super::questions::{AnswerBody, ReviewBody, answered, question};
 use super::runs::{Run, labels_of};
 use super::server::Server;
@@ -21,78 +22,6 @@ use std::mem::size_of;
 /// Portraits of one answer.
 const MAX_PORTRAITS: u32 = 64;
 
-/// The body of a page.
-pub(super) struct Found {
-    pub(super) kind: &'static str,
-    pub(super) bytes: Bytes,
-}
-
-type Answer = Result<Found, wire::Error>;
-
-/// Sends the request of the named variant, and returns its reply with the frames.
-macro_rules! request {
-    ($server:expr, $variant:ident($body:expr)) => {
-        request!($server, $variant($body), None)
-    };
-    ($server:expr, $variant:ident($body:expr), $frames:expr) => {
-        match $server.ask(Body::$variant($body), $frames).await? {
-            (reply::Result::$variant(reply), frames) => Ok((reply, frames)),
-            (other, _) => Err(unexpected(&other)),
-        }
-    };
-}
-
-/// Parameters of a query.
-struct Query<'a>(&'a [(String, String)]);
-
-impl Query<'_> {
-    fn find(&self, name: &str) -> Option<&str> {
-        let found = self.0.iter().find(|(key, _)| key == name);
-        found.map(|(_, value)| value.as_str())
-    }
-
-    fn text(&self, name: &str) -> Result<String, wire::Error> {
-        let found = self.find(name).map(str::to_owned);
-        found.ok_or_else(|| {
-            convert::field_error(
-                ErrorReason::FieldMissing,
-                name,
-                format!("{name} is missing"),
-            )
-        })
-    }
-
-    fn number<T: std::str::FromStr + Default>(&self, name: &str) -> Result<T, wire::Error> {
-        let Some(text) = self.find(name) else {
-            return Ok(T::default());
-        };
-        text.parse().map_err(|_| {
-            let message = format!("{name} is {text:?}, which is no number here");
-            convert::field_error(ErrorReason::FieldRange, name, message)
-        })
-    }
-}
-
-/// JSON, for which memory is reserved.
-fn json_page(text: Reserved<String>) -> Found {
-    let Reserved { value, memory } = text;
-    let value = Bytes::from(value);
-    Found {
-        kind: "application/json",
-        bytes: Reserved { value, memory }.into_bytes(),
-    }
-}
-
-/// Makes JSON that can be large, off the threads that wait.
-async fn json_of(server: &Server, make: impl FnOnce() -> Value + Send + 'static) -> Answer {
-    let value = server.hands.work(move || make().to_string()).await?;
-    let memory = server
-        .hands
-        .memory(value.capacity() as u64)
-        .ok_or_else(full)?;
-    Ok(json_page(Reserved { value, memory }))
-}
-
 /// Answers a request that changes nothing.
 pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]) -> Answer {
     let query = Query(query);
@@ -100,6 +29,8 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
         "library" => library(server).await,
         "collection" => collection(server, query.text("collection")?).await,
         "portraits" => portraits(server, &query).await,
+        "proposals" => choices::proposals(server, query.text("collection")?).await,
+        "links" => choices::links(server, query.text("collection")?).await,
         "map" => map(server, &query).await,
         "nearest" => {
             let request = wire::NearestRequest {
@@ -274,6 +205,7 @@ async fn portraits(server: &Server, query: &Query<'_>) -> Answer {
         collection,
         shapes,
         detail: detail.into(),
+        proposal: query.number("proposal")?,
     };
     let memory = server.hands.memory_of_answer().await?;
     let (reply, frames) = request!(server, GetPortraits(request))?;
@@ -345,25 +277,6 @@ struct Undo {
     collection: String,
 }
 
-/// Parses the body of a change, off the threads that wait. Its memory is given back when the parsed
-/// value is dropped.
-async fn parsed<T: serde::de::DeserializeOwned + Send + 'static>(
-    server: &Server,
-    sent: Reserved<Vec<u8>>,
-) -> Result<Reserved<T>, wire::Error> {
-    let Reserved {
-        value: bytes,
-        memory,
-    } = sent;
-    let read = move || serde_json::from_slice(&bytes);
-    let value = server.hands.work(read).await?.map_err(|e| {
-        let text = format!("the body is not what is expected: {e}");
-        let code = wire::ErrorCode::InvalidArgument;
-        convert::error(code, ErrorReason::MalformedMessage, text)
-    })?;
-    Ok(Reserved { value, memory })
-}
-
 /// Makes a change.
 pub(super) async fn change(server: &Server, path: &str, sent: Reserved<Vec<u8>>) -> Answer {
     match path {
@@ -420,6 +333,9 @@ pub(super) async fn change(server: &Server, path: &str, sent: Reserved<Vec<u8>>)
             })
             .await
         }
+        "choose" => choices::choose(server, sent).await,
+        "link" => choices::link(server, sent).await,
+        "unlink" => choices::unlink(server, sent).await,
         "undo" => {
             let change = parsed::<Undo>(server, sent).await?.value;
             let request = wire::UndoRequest {

@@ -6,8 +6,10 @@
 //! requests, the sockets and signals are served.
 
 mod api;
+mod choices;
 mod connection;
 mod door;
+mod exchange;
 mod guard;
 mod hands;
 mod page;

@@ -172,9 +172,11 @@ fn portraits(
     for name in &r.shapes {
         shapes.push(match r.detail() {
             wire::PortraitDetail::Unspecified | wire::PortraitDetail::Proxy => {
-                let (mapped, labels, version) = library
-                    .labelled_proxy(&r.collection, name)
-                    .map_err(refused)?;
+                let found = match r.proposal {
+                    0 => library.labelled_proxy(&r.collection, name),
+                    n => library.proposed_proxy(&r.collection, name, n),
+                };
+                let (mapped, labels, version) = found.map_err(refused)?;
                 portrait::proxy(&mut pack, name, version, &mapped.view(), &labels)
             }
             wire::PortraitDetail::Functions => {

@@ -107,6 +107,18 @@ pub fn check_portraits(
     _frames: &mut NamedFrames,
 ) -> Result<(), wire::Error> {
     known::<wire::PortraitDetail>(r.detail, "detail")?;
+    let is_proxy = matches!(
+        r.detail(),
+        wire::PortraitDetail::Unspecified | wire::PortraitDetail::Proxy
+    );
+    if r.proposal > 0 && !is_proxy {
+        let text = format!(
+            "proposal {} is wanted of {}, but only a portrait of the proxy can have its classes",
+            r.proposal,
+            r.detail().as_str_name()
+        );
+        return Err(field_error(ErrorReason::FieldRange, "proposal", text));
+    }
     at_most("shapes", r.shapes.len(), MAX_PORTRAITS)
 }
 
@@ -366,9 +378,10 @@ mod tests {
         assert!(rows(4).iter().all(Result::is_err));
         // Landmarks are no faces.
         assert!(faces[..4].iter().all(Result::is_ok) && faces[4].is_err());
-        let portraits = |detail, n| {
+        let portraits = |detail, n, proposal| {
             let request = wire::GetPortraitsRequest {
                 detail,
+                proposal,
                 shapes: vec![String::new(); n],
                 ..Default::default()
             };
@@ -379,7 +392,8 @@ mod tests {
             add(spec(1, 1), 2, 5),
             map(points(2, 1_000)),
             transfer(points(0, 0)),
-            portraits(3, 256),
+            portraits(3, 256, 0),
+            portraits(1, 256, 8),
         ] {
             assert_eq!(done, Ok(()));
         }
@@ -393,8 +407,9 @@ mod tests {
             (map(points(0, 1_001)), "points.landmarks"),
             (transfer(points(i32::MIN, 0)), "points.orientation"),
             (transfer(points(0, 1_001)), "points.landmarks"),
-            (portraits(4, 0), "detail"),
-            (portraits(0, 257), "shapes"),
+            (portraits(4, 0, 0), "detail"),
+            (portraits(0, 257, 0), "shapes"),
+            (portraits(2, 1, 1), "proposal"),
         ] {
             let e = done.unwrap_err();
             assert_eq!(e.reason(), ErrorReason::FieldRange, "{field}");

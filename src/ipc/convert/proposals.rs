@@ -19,6 +19,7 @@ pub fn proposals(p: &Proposals) -> wire::ListProposalsReply {
         n_steps: p.n_steps,
         n_done: p.n_done,
         n_shapes: p.n_shapes,
+        shapes: p.shapes.clone(),
     }
 }
 

@@ -73,6 +73,32 @@ class Actions {
     return this.change("split", { label }, said, fault);
   }
 
+  /** Makes a proposal of a set the labels. */
+  choose(n, set) {
+    const said = (done) => {
+      const follow = done.n_stale ? `; ${counted(done.n_stale, "shape")} still to follow` : "";
+      return `Proposal ${n} is the labels now: ${counted(done.n_labels, "label")}${follow}.`;
+    };
+    return this.change("choose", { n, set }, said);
+  }
+
+  /** Links two parts. */
+  link(kind, a, b, fault) {
+    const part = ({ shape, part }) => ({ shape, part });
+    return this.change("link", { kind, a: part(a), b: part(b) }, (done) => {
+      const words = kind === "same" ? "have one label" : "have different labels";
+      const there = done.changed ? "from now on" : "already: the same link is there";
+      const follow = done.n_stale ? `; ${counted(done.n_stale, "shape")} still to follow` : "";
+      return `${partText(a)} and ${partText(b)} ${words} ${there}${follow}.`;
+    }, fault);
+  }
+
+  /** Removes a link. */
+  unlink({ id, a, b }) {
+    const said = () => `${partText(a)} and ${partText(b)} are not linked any more.`;
+    return this.change("unlink", { id }, said);
+  }
+
   /** Goes to the shape that is most worth labelling. */
   suggest() {
     const { app } = this;

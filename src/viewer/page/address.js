@@ -1,12 +1,15 @@
 // Converts the state of the page to its address and back:
-// `#collection/shape/view/detail?search=…&label=…&order=…`.
+// `#collection/shape/view/detail?search=…&label=…&order=…`,
+// and `show=proposals` in place of the cards.
 
 /**
  * The views of a shape. Some have a detail: the shape from which a map comes, or the number of an
  * eigenfunction or a time, from 1.
  */
-const VIEWS = ["labels", "eigen", "hks", "map", "history", "correct", "ask"];
+const VIEWS = ["labels", "eigen", "hks", "map", "history", "correct", "ask", "link"];
 const ORDERS = ["arrival", "name", "doubt", "changed", "moved"];
+/** What is shown in place of the cards. */
+const SHOWS = ["proposals"];
 const VERDICTS = ["unseen", "corrected", "approved", "doubtful"];
 
 function decoded(text) {
@@ -32,17 +35,20 @@ function readAddress(hash) {
     search: asked.get("search") ?? "",
     label: /^\d+$/.test(label ?? "") ? Number(label) : null,
     review: VERDICTS.includes(asked.get("review")) ? asked.get("review") : null,
+    show: !shape && SHOWS.includes(asked.get("show")) ? asked.get("show") : null,
     order: ORDERS.includes(asked.get("order")) ? asked.get("order") : "arrival",
   };
 }
 
-function writeAddress({ collection, shape, view, detail, search, label, review, order }) {
+function writeAddress(address) {
+  const { collection, shape, view, detail, search, label, review, show, order } = address;
   const path = shape ? [collection, shape, view ?? "labels", detail] : [collection];
   const said = path.filter((part) => part !== null && part !== undefined && part !== "");
   const asked = new URLSearchParams();
   if (search) asked.set("search", search);
   if (label !== null && label !== undefined) asked.set("label", label);
   if (review) asked.set("review", review);
+  if (show && !shape) asked.set("show", show);
   if (order && order !== "arrival") asked.set("order", order);
   const query = asked.toString();
   return `#${said.map((part) => encodeURIComponent(part)).join("/")}${query ? `?${query}` : ""}`;

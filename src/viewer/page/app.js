@@ -14,6 +14,8 @@ const OKABE_ITO = [
 /** What the stage is, for those who do not see it. */
 const TURNED =
   "The shape; drag or Shift and arrows turn it, scroll, + or − zooms";
+const LINKED =
+  "The shape; arrows move the cursor, Space chooses the part, Shift and arrows turn it";
 const PAINTED =
   "The shape; arrows move the brush, Space paints, Shift and arrows turn it, + or − zooms";
 /** Colour of faces outside the selected label. */
@@ -31,6 +33,8 @@ class App {
     this.actions = new Actions(this);
     this.verdicts = new Verdicts(this);
     this.asker = new Asker(this);
+    this.proposals = new Proposals(this);
+    this.linker = new Linker(this);
     this.gallery = new Gallery(this);
     this.stage = new Stage(this);
     this.pointer = new Pointer(this);
@@ -153,7 +157,8 @@ class App {
     select.hidden = names.length === 0;
     const edit = this.source.live && library.edit;
     for (const id of ["undo", "redo", "ask", "suggest"]) $(id).hidden = !edit;
-    for (const mode of ["correct", "ask"])
+    $("propose").hidden = !this.source.live;
+    for (const mode of ["correct", "ask", "link"])
       document.querySelector(`[data-mode=${mode}]`).hidden = !edit;
     this.edit = edit;
     document.documentElement.toggleAttribute("data-edit", edit);
@@ -177,6 +182,8 @@ class App {
     $("collections").value = name;
     this.changes.forget();
     this.asker.question = null;
+    this.proposals.forget();
+    this.linker.forget();
     this.changes.show();
     this.gallery.show([]);
     const found = await this.source.collection(name);
@@ -197,6 +204,7 @@ class App {
     document.documentElement.dataset.loadedMs = Math.round(performance.now());
     this.loaded = true;
     this.thumbnailsDrawn();
+    this.proposals.follow();
     this.open();
   }
 
@@ -326,6 +334,7 @@ class App {
     const wanted = writeAddress({ ...view, collection: null, shape: null });
     if (wanted !== this.filtered) this.filter();
     if (dims) this.recolour();
+    this.proposals.follow();
     await this.open();
   }
 
@@ -361,6 +370,7 @@ class App {
     this.selected = shape;
     this.detail = view.detail;
     stage.choose(view);
+    if (other) this.linker.left(view.view);
     $("stage").hidden = $("panel").hidden = false;
     $("main").classList.add("open");
     this.gallery.select(shape);
@@ -391,9 +401,9 @@ class App {
       tab.setAttribute("aria-selected", String(chosen));
       tab.tabIndex = chosen ? 0 : -1;
     }
-    const paints = this.stage.mode === "correct";
-    $("scene").classList.toggle("painting", paints);
-    $("scene").setAttribute("aria-label", paints ? PAINTED : TURNED);
+    const { mode } = this.stage;
+    $("scene").classList.toggle("painting", mode === "correct");
+    $("scene").setAttribute("aria-label", { correct: PAINTED, link: LINKED }[mode] ?? TURNED);
     this.changes.showButtons();
   }
 

@@ -2,7 +2,7 @@
 // progress.
 
 /** Paths of changes that record who made them. */
-const SIGNED = ["correct", "answer", "review"];
+const SIGNED = ["correct", "answer", "review", "link"];
 
 class Changes {
   constructor(app) {
@@ -38,7 +38,10 @@ class Changes {
     const { app } = this;
     const since = app.about.sequence;
     const done = await app.source.change(change.path, change.body);
-    change.created = createdLabel(change, done);
+    // The same link was there: there is nothing to undo.
+    if (done.changed === false) return done;
+    change.created = created(change, done);
+    if (change.path === "unlink") change.parts = [done.link.a, done.link.b];
     this.made.push(change);
     this.begin(since, change, change.text);
     return done;
@@ -84,9 +87,9 @@ class Changes {
       const was = change.created;
       await this.make(change);
       this.undone.pop();
-      // A label that is made again has another id.
+      // A label or a link that is made again has another id.
       if (was !== undefined)
-        for (const later of this.undone) replaceLabel(later.body, was, change.created);
+        for (const later of this.undone) replaceId(later, change.path, was, change.created);
       app.toast(`Redone: ${change.text}.`);
       await app.reload();
     }));
@@ -216,6 +219,9 @@ function changeText(app, path, body) {
     case "name": return `the name “${body.name}”`;
     case "merge": return `the merge of ${name(body.label)} into ${name(body.into)}`;
     case "split": return `the split of ${name(body.label)}`;
+    case "choose": return `the choice of proposal ${body.n}`;
+    case "link": return `the link of ${partText(body.a)} and ${partText(body.b)}`;
+    case "unlink": return `the removal of link ${body.id}`;
     default: return path;
   }
 }
@@ -223,28 +229,39 @@ function changeText(app, path, body) {
 /** Returns a noun for a change that was not made on this page. */
 function undoneText(app, { change, subject }) {
   const known = { approve: "the approval", doubt: "the doubt", name: "the newest name of a label",
-    correct: "the correction", answer: "the answer", up: "the change of the up axis" }[change];
+    correct: "the correction", answer: "the answer", up: "the change of the up axis",
+    choose: "the choice of proposal", same: "the link", differ: "the link",
+    unlink: "the removal of the link" }[change];
   const label = app.labelName(Number(subject));
   if (change === "merge" || change === "split") return `the ${change} of “${label}”`;
+  if (change === "choose") return `${known} ${subject}`;
   return `${known ?? change}${subject && change !== "up" ? ` of ${subject}` : ""}`;
 }
 
 /** Returns whether this change is the one that was undone in the library. */
-function isOf({ path, body }, undone) {
-  const kind = path === "review" ? (body.state === "approved" ? "approve" : "doubt") : path;
-  const subject = body.shape ?? (path === "name" ? undone.subject : String(body.label));
-  return kind === undone.change && subject === undone.subject;
+function isOf({ path, body, parts }, undone) {
+  const ends = path === "link" ? [body.a, body.b] : parts;
+  const kinds = { review: body.state === "approved" ? "approve" : "doubt", link: body.kind };
+  const subjects = { name: undone.subject, choose: String(body.n) };
+  const subject =
+    ends?.map(partText).join(" ") ?? subjects[path] ?? body.shape ?? String(body.label);
+  return (kinds[path] ?? path) === undone.change && subject === undone.subject;
 }
 
-/** Returns the id of the label that a change made, if it may have made one. */
-function createdLabel({ path, body }, done) {
+/** Returns the id of the label or the link that a change made, if it may have made one. */
+function created({ path, body }, done) {
   if (path === "split") return done.label.id;
   if (path === "answer" && body.named) return done.label;
+  if (path === "link") return done.link.id;
   return undefined;
 }
 
-/** Replaces a label in the body of a change. */
-function replaceLabel(body, was, now) {
+/** Replaces the id of a label or a link, which a change of the kind `made` made, in a later one. */
+function replaceId({ path, body }, made, was, now) {
+  if (made === "link") {
+    if (path === "unlink" && body.id === was) body.id = now;
+    return;
+  }
   for (const key of ["label", "into"]) if (body[key] === was) body[key] = now;
   for (const run of body.runs ?? []) if (run[2] === was) run[2] = now;
 }

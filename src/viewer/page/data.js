@@ -201,6 +201,21 @@ class LiveSource {
     return this.pack("map", { collection, from, to });
   }
 
+  proposals(collection) {
+    return this.json("proposals", { collection });
+  }
+
+  /** Returns portraits of shapes in the classes of a proposal. */
+  async proposed(collection, proposal, names) {
+    const shapes = names.map((name) => ["shape", name]);
+    const parameters = [["collection", collection], ["proposal", proposal], ...shapes];
+    return (await this.pack("portraits", parameters)).shapes;
+  }
+
+  links(collection) {
+    return this.json("links", { collection });
+  }
+
   question(collection) {
     return this.json("question", { collection });
   }

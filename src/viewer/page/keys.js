@@ -19,13 +19,16 @@ class Keys {
     $("next").onclick = () => app.step(1);
     $("skip").onfocus = () =>
       ($("skip").textContent = app.selected ? "Skip to the shape" : "Skip to the shapes");
-    $("skip").onclick = () =>
-      (app.selected ? app.tab() : app.gallery.root.querySelector(".card"))?.focus();
+    $("skip").onclick = () => {
+      const first = app.proposals.isOpen ? $("finer") : app.gallery.root.querySelector(".card");
+      (app.selected ? app.tab() : first)?.focus();
+    };
     $("theme").onclick = () =>
       setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark", true);
     $("undo").onclick = () => app.changes.undo();
     $("redo").onclick = () => app.changes.redo();
     $("ask").onclick = () => app.attempt(() => app.asker.next());
+    $("propose").onclick = () => app.proposals.toggle();
     $("suggest").onclick = () => app.actions.suggest();
     $("help").onclick = () => $("keys").showModal();
     this.listenToTabs();
@@ -60,8 +63,9 @@ class Keys {
     }
     if (event.key === "?" && !event.ctrlKey && !event.altKey) return $("keys").showModal();
     if (event.ctrlKey || event.altKey || event.metaKey || event.shiftKey) return;
-    if (event.key === "Escape") return app.editor.isOpen ? app.editor.close() : this.leave();
+    if (event.key === "Escape") return this.escape();
     if (app.edit && app.loaded && this.everywhere(event)) return event.preventDefault();
+    if (app.proposals.isOpen && app.proposals.key(event)) return event.preventDefault();
     if (!app.selected) return;
     if (app.edit && this.besideAShape(event)) return event.preventDefault();
     if (event.target.closest("[role=tablist]")) return;
@@ -70,8 +74,13 @@ class Keys {
     if (event.key === "ArrowRight") app.step(1);
   }
 
-  leave() {
-    if (this.app.selected) $("close").click();
+  /** Closes what was opened last. */
+  escape() {
+    const { app } = this;
+    if (app.editor.isOpen) return app.editor.close();
+    if (app.stage.mode === "link" && app.selected && app.linker.key("Escape")) return;
+    if (app.selected) $("close").click();
+    else if (app.proposals.isOpen) app.proposals.toggle();
   }
 
   /** Handles a key of a live page; returns whether it has a meaning. */
@@ -79,6 +88,8 @@ class Keys {
     const { app } = this;
     if (event.key === "q") app.attempt(() => app.asker.next());
     else if (event.key === "g") app.actions.suggest();
+    else if (event.key === "p") app.proposals.toggle();
+    else if (event.key === "k") app.linker.open();
     else if (event.key === "l") app.editor.openSome();
     else if (event.key === "v" && app.changes.newest) app.changes.toggle();
     else return false;
@@ -93,6 +104,7 @@ class Keys {
     else if (event.key === "u") app.actions.doubt();
     else if (mode === "ask") return app.asker.key(event.key);
     else if (mode === "correct") return app.painter.key(event);
+    else if (mode === "link") return app.linker.key(event.key);
     else return false;
     return true;
   }

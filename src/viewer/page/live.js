@@ -21,6 +21,8 @@ class Live {
       this.status(busy.join(" · ") || "live", busy.length ? "work" : "");
       if (!mine && names.length) await app.go({ collection: names[0], shape: null });
       else if (mine && app.loaded && this.differs(mine)) await this.reload();
+      // Proposals are made in the background, without an event.
+      else if (app.proposals.isOpen) await app.proposals.look();
     } catch {
       this.status("the daemon does not answer", "bad");
     }
@@ -55,7 +57,9 @@ class Live {
         app.portraits.set(portrait.name, portrait);
         app.gallery.draw(portrait.name, true);
       }
+    app.linker.labelsChanged();
     await app.changes.show();
+    if (app.proposals.isOpen) await app.proposals.look();
     if (app.view.order === "moved") app.filter();
     else app.gallery.describeAll();
     const { selected, stage } = app;
@@ -63,7 +67,8 @@ class Live {
     if (!app.byName.has(selected)) return app.go({ shape: null }, { replace: true });
     app.panel.show(selected);
     const shown = ["labels", "history", "correct", "ask"].includes(stage.mode);
-    if (changed.includes(selected) && shown && stage.painting.size === 0) await stage.refresh();
+    const isNew = changed.includes(selected) && shown && stage.painting.size === 0;
+    if (isNew || (changed.length && stage.mode === "link")) await stage.refresh();
     else app.panel.showControls();
   }
 }

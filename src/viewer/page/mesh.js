@@ -104,6 +104,13 @@ class Mesh {
     return (this._across = across);
   }
 
+  /** Returns twice the area of each face. */
+  get faceAreas() {
+    const n = this.faceNormals;
+    return Float32Array.from({ length: this.nFaces }, (_, f) =>
+      Math.hypot(n[3 * f], n[3 * f + 1], n[3 * f + 2]));
+  }
+
   get faceNormals() {
     if (this._faceNormals) return this._faceNormals;
     const { positions: p, faces, nFaces } = this;

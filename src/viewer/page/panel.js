@@ -20,10 +20,12 @@ class Panel {
     this.mapBox = make("div");
     const state = shape.stale ? ", waits to be relabelled" : "";
     const past = [make("h3", {}, "History"), log];
+    const links = app.stage.mode === "link" ? app.linker.section() : [];
     const sections = app.stage.mode === "history" ? past : [
       this.mapBox,
       make("h3", {}, `Parts (${shape.parts.length})`),
       this.parts(shape),
+      ...links,
       make("h3", {}, "Most alike"),
       near,
       ...past,
@@ -71,6 +73,7 @@ class Panel {
     const { app } = this;
     const list = make("div", { className: "parts" });
     let pressed = null;
+    const links = app.stage.mode === "link";
     const largest = Math.max(...shape.parts.map((p) => p.area_share), 1e-9);
     shape.parts.forEach((part, i) => {
       const colour = app.colour(part.label);
@@ -81,7 +84,8 @@ class Panel {
         "button",
         { className: "part", "aria-pressed": "false", "data-label": part.label },
         swatch(colour),
-        make("span", {}, app.labelName(part.label)),
+        make("span", {}, links && i < 9 ? make("kbd", {}, String(i + 1)) : null,
+          app.labelName(part.label)),
         make("span", { className: "share" }, percent(part.area_share)),
         make("span", { className: "track" }, fill),
       );
@@ -90,7 +94,9 @@ class Panel {
       const lit = () => app.stage.setHighlight(highlight);
       const unlit = () => app.stage.setHighlight(pressed?.highlight ?? null);
       [row.onmouseenter, row.onfocus, row.onmouseleave, row.onblur] = [lit, lit, unlit, unlit];
+      if (links && app.linker.isFirst(shape.name, i)) row.setAttribute("aria-pressed", "true");
       row.onclick = () => {
+        if (links) return app.linker.pick(shape.name, i);
         if (app.stage.mode === "correct") return app.stage.painting.paintPart(highlight);
         pressed?.row.setAttribute("aria-pressed", "false");
         pressed = pressed?.row === row ? null : { row, highlight };
@@ -172,6 +178,7 @@ class Panel {
     else if (stage.mode === "map") this.mapControls(box);
     else if (stage.mode === "correct") app.painter.controls(box);
     else if (stage.mode === "ask") app.asker.controls(box);
+    else if (stage.mode === "link") app.linker.controls(box);
     else
       box.replaceChildren(
         make(
@@ -275,6 +282,7 @@ const CAUSES = {
   merge: "labels were merged",
   split: "a label was split",
   undo: "a change was undone",
+  choice: "a proposal was chosen",
 };
 
 function shapeEvent(e) {
@@ -309,6 +317,12 @@ function labelEvent(e, app) {
       return { text: `up axis ${e.to} in place of ${e.from}`, person: true };
     case "chosen":
       return { text: `proposal ${e.proposal} chosen, ${e.n_labels} labels`, person: true };
+    case "parts_linked": {
+      const words = e.demand === "same" ? "has the label of" : "has another label than";
+      return { text: `${partText(e.a)} ${words} ${partText(e.b)}: link ${e.link}`, person: true };
+    }
+    case "parts_unlinked":
+      return { text: `link ${e.link} removed`, person: true };
     default:
       return null;
   }

@@ -11,6 +11,8 @@ const ZOOM_STEP = 1.15;
 const CURSOR_STEP = 12;
 /** Maximum number of faces of a mesh on which the pointer looks for one at each move. */
 const MAX_HOVER = 30_000;
+/** Pixels by which the pointer may move during a click. */
+const CLICK = 4;
 
 class Pointer {
   constructor(app) {
@@ -27,13 +29,24 @@ class Pointer {
     return this.stage.mode === "correct";
   }
 
+  get links() {
+    return this.stage.mode === "link";
+  }
+
+  /** Returns whether the arrow keys move a cursor. */
+  get points() {
+    return this.paints || this.links;
+  }
+
   listen() {
     const { canvas, stage } = this;
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
     canvas.addEventListener("pointerup", (event) => {
+      const chooses = this.links && this.drag?.travelled <= CLICK;
       this.release();
+      if (chooses) this.choosePart(event);
       this.hover(event);
     });
     canvas.addEventListener("pointercancel", () => this.release());
@@ -62,7 +75,7 @@ class Pointer {
     const shift = event.shiftKey || event.button === 2;
     if (this.paints) strokes.begin();
     const paint = this.paints && !shift && !event.altKey && stage.painting.paint(event);
-    this.drag = { x: event.clientX, y: event.clientY, shift, paint };
+    this.drag = { x: event.clientX, y: event.clientY, shift, paint, travelled: 0 };
     if (paint) return;
     strokes.open = null;
     canvas.classList.add("turning");
@@ -79,6 +92,9 @@ class Pointer {
     }
     const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
     [drag.x, drag.y] = [event.clientX, event.clientY];
+    drag.travelled += Math.hypot(dx, dy);
+    // The shape does not move under a click.
+    if (this.links && drag.travelled <= CLICK) return;
     if (drag.shift) {
       stage.moved = true;
       stage.view.pan[0] += (2 * dx * stage.scenes.length) / canvas.clientWidth;
@@ -94,6 +110,14 @@ class Pointer {
     this.canvas.classList.remove("turning");
   }
 
+  /** Chooses the part at a position of the page for a link. */
+  choosePart(at) {
+    const found = this.stage.pick(at);
+    if (!found) return void ($("spoken").textContent = "beside the shape");
+    const { mesh } = found.scene;
+    this.app.linker.pick(mesh.portrait.name, mesh.parts[found.face]);
+  }
+
   turn(yaw, tilt) {
     const { view } = this.stage;
     view.yaw += yaw;
@@ -106,8 +130,9 @@ class Pointer {
     const { stage } = this;
     const zoom = { "+": ZOOM_STEP, "=": ZOOM_STEP, "-": 1 / ZOOM_STEP }[event.key];
     const arrow = event.key.startsWith("Arrow") ? event.key.slice(5) : null;
-    // The letters have other meanings where a person answers questions.
-    const letters = stage.mode === "ask" ? {} : { a: "Left", d: "Right", w: "Up", s: "Down" };
+    // The letters have other meanings where a person answers questions or links parts.
+    const isFree = !["ask", "link"].includes(stage.mode);
+    const letters = isFree ? { a: "Left", d: "Right", w: "Up", s: "Down" } : {};
     const to = arrow && event.shiftKey ? arrow : letters[event.key];
     if (zoom) stage.zoom(zoom);
     else if (event.key === "0") {
@@ -116,8 +141,8 @@ class Pointer {
     } else if (to) {
       const [x, y] = { Left: [-1, 0], Right: [1, 0], Up: [0, 1], Down: [0, -1] }[to];
       this.turn(x * TURN_STEP, y * TILT_STEP);
-    } else if (arrow && this.paints) this.step(arrow);
-    else if (event.key === " " && this.paints) this.dab();
+    } else if (arrow && this.points) this.step(arrow);
+    else if (event.key === " " && this.points) this.dab();
     else return false;
     return true;
   }
@@ -143,6 +168,7 @@ class Pointer {
   dab() {
     const { painting } = this.stage;
     if (!this.at) return this.step("Up");
+    if (this.links) return this.choosePart(this.at);
     painting.strokes.begin();
     const painted = painting.paint(this.at);
     painting.strokes.end();
@@ -163,24 +189,27 @@ class Pointer {
     const { stage, at } = this;
     const { painting } = stage;
     const cursor = $("cursor");
-    const shown = this.paints && at && (byKeys || stage.pick(at));
+    const shown = at && (this.paints ? byKeys || stage.pick(at) : this.links && byKeys);
     cursor.hidden = !shown;
     if (!shown) return;
     const box = this.canvas.getBoundingClientRect();
     // The same factor as in View.scale.
     const diameter = 0.9 * painting.reach() * stage.view.zoom * Math.min(box.width, box.height);
-    const pixels = painting.tool === "part" ? CURSOR_STEP : diameter;
+    const tool = this.links ? "part" : painting.tool;
+    const pixels = tool === "part" ? CURSOR_STEP : diameter;
     Object.assign(cursor.style, {
       left: `${at.clientX - box.left}px`,
       top: `${at.clientY - box.top}px`,
       width: `${pixels}px`,
       height: `${pixels}px`,
     });
-    cursor.dataset.tool = painting.tool;
+    cursor.dataset.tool = tool;
   }
 
   labelAt({ face, scene }) {
-    return this.app.labelName(this.stage.painting.labelsOf(scene.mesh)[face]);
+    const { mesh } = scene;
+    const name = this.app.labelName(this.stage.painting.labelsOf(mesh)[face]);
+    return this.links ? `${mesh.portrait.name}:${mesh.parts[face]}, ${name}` : name;
   }
 
   /** Shows beside the pointer what is under it. */

@@ -111,6 +111,7 @@ class Stage {
     if (LABEL_VIEWS.includes(mode)) return this.buildLabels(name, portrait, ticket);
     const proxy = new Mesh(portrait, this.app.up);
     if (mode === "map") return this.buildMap(name, proxy);
+    if (mode === "link") return this.buildLink(name, proxy);
     return [await this.buildFunction(mode, name, proxy)];
   }
 
@@ -139,6 +140,20 @@ class Stage {
     if (ticket !== this.ticket) return [];
     const note = `${counted(info.n_polygons, "face")}, as sent`;
     return [{ mesh: new Mesh(surface, app.up), caption: name, note }];
+  }
+
+  /**
+   * Shows the parts of the proxy, which are those that the daemon knows. A part of another shape
+   * that is chosen already is shown beside it.
+   */
+  buildLink(name, mesh) {
+    const { app } = this;
+    const { first } = app.linker;
+    const scene = { mesh, caption: name, note: "click a part" };
+    const portrait = first && first.shape !== name && app.portraits.get(first.shape);
+    if (!portrait) return [scene];
+    const note = `part ${first.part} is chosen`;
+    return [{ mesh: new Mesh(portrait, app.up), caption: first.shape, note }, scene];
   }
 
   async buildFunction(mode, name, mesh) {
@@ -294,7 +309,9 @@ class Stage {
       }
       const labels = this.painting.labelsOf(mesh);
       const dim = (c) => c.map((x) => 0.2 * x + 0.8 * 178);
-      const lit = this.asked(mesh) ?? this.highlighted(mesh, highlight);
+      const lit = this.mode === "link"
+        ? this.linked(mesh)
+        : this.asked(mesh) ?? this.highlighted(mesh, highlight);
       const of = (f) => {
         const c = app.shownColour(labels[f]);
         return !lit || lit(f) ? c : dim(c);
@@ -309,6 +326,18 @@ class Stage {
     const { asker } = this.app;
     if (this.mode !== "ask" || !mesh.polygons || !asker.asks(this.name)) return null;
     return (f) => asker.question.faces.has(mesh.polygons[f]);
+  }
+
+  /** Returns which faces of a mesh belong to the chosen part, or to one that is pointed at. */
+  linked(mesh) {
+    const { name } = mesh.portrait;
+    const { first } = this.app.linker;
+    const parts = [
+      name === first?.shape ? first.part : undefined,
+      name === this.name ? this.highlight?.part : undefined,
+    ];
+    if (parts.every((part) => part === undefined)) return null;
+    return (f) => parts.includes(mesh.parts[f]);
   }
 
   /** Returns which faces of a mesh a highlighted part or label covers. */

@@ -109,6 +109,7 @@ fn what_poisons_an_answer_costs_that_request_alone() {
             collection: c(),
             shapes: vec!["a".to_owned(), kind.clone()],
             detail: wire::PortraitDetail::Surface.into(),
+            proposal: 0,
         };
         let parts = wire::GetPartCorrespondenceRequest {
             collection: c(),

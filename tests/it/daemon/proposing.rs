@@ -96,6 +96,50 @@ fn classes(client: &mut Client, n: u32) -> BTreeMap<String, Vec<i32>> {
     reply.shapes.into_iter().map(of).collect()
 }
 
+fn portraits(names: &[&str], proposal: u32) -> wire::GetPortraitsRequest {
+    wire::GetPortraitsRequest {
+        collection: "c".to_owned(),
+        shapes: names.iter().map(|n| (*n).to_owned()).collect(),
+        detail: wire::PortraitDetail::Proxy.into(),
+        proposal,
+    }
+}
+
+/// Portraits have the classes of a proposal, of each of its shapes alone.
+fn are_drawn(client: &mut Client, found: &wire::ListProposalsReply) {
+    let name = found.shapes[2].as_str();
+    for p in &found.proposals {
+        let request = portraits(&[name], p.n);
+        let (reply, frames) = call!(client, GetPortraits(request), frames).unwrap();
+        let reader = FrameReader::new(&frames);
+        let pack = reader.file(reply.pack.as_ref(), "pack").unwrap();
+        let n = u32::from_le_bytes(pack[..4].try_into().unwrap()) as usize;
+        let header: serde_json::Value = serde_json::from_slice(&pack[4..4 + n]).unwrap();
+        let shape = &header["shapes"][0];
+        assert_eq!(shape["name"], name);
+        let palette: Vec<i64> = shape["palette"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|label| label.as_i64().unwrap())
+            .collect();
+        let of_polygons: BTreeSet<i64> = classes(client, p.n)[name]
+            .iter()
+            .map(|l| (*l).into())
+            .collect();
+        assert_eq!(palette, of_polygons.into_iter().collect::<Vec<_>>());
+    }
+    let last = found.proposals.len() as u32;
+    let unknown = refusal(client, Body::GetPortraits(portraits(&["nobody"], 1)));
+    assert_eq!(unknown.0, ErrorCode::NotFound);
+    let beyond = refusal(client, Body::GetPortraits(portraits(&[name], last + 1)));
+    let range = (ErrorCode::InvalidArgument, ErrorReason::FieldRange);
+    assert_eq!(beyond, range);
+    let mut functions = portraits(&[name], 1);
+    functions.detail = wire::PortraitDetail::Functions.into();
+    assert_eq!(refusal(client, Body::GetPortraits(functions)), range);
+}
+
 fn refused(client: &mut Client, n: u32, set: &str) -> (ErrorCode, ErrorReason) {
     let (collection, set) = ("c".to_owned(), set.to_owned());
     let request = wire::ChooseProposalRequest { collection, n, set };
@@ -132,6 +176,9 @@ fn a_proposal_is_chosen_undone_and_still_there_after_a_kill() {
     let all: Vec<_> = numbers.iter().map(|n| classes(client, *n)).collect();
     let distinct: BTreeSet<_> = all.iter().collect();
     assert_eq!(distinct.len(), all.len());
+    let names: Vec<&String> = chairs.iter().map(|(name, _)| name).collect();
+    assert_eq!(found.shapes.iter().collect::<Vec<_>>(), names);
+    are_drawn(client, &found);
 
     let chosen = *other(&found);
     assert!(chosen.differs > 0.05 && !chosen.in_force, "{chosen:?}");
@@ -219,6 +266,12 @@ fn added_shapes_get_new_proposals_and_do_not_overrule_the_choice() {
     assert_eq!(
         offered.n_shapes, 7,
         "at 7 shapes the collection would be clustered again"
+    );
+    let seven: Vec<&String> = chairs[..7].iter().map(|(name, _)| name).collect();
+    assert_eq!(offered.shapes.iter().collect::<Vec<_>>(), seven);
+    assert_eq!(
+        refusal(client, Body::GetPortraits(portraits(&[&chairs[7].0], 1))),
+        (ErrorCode::InvalidArgument, ErrorReason::FieldRange)
     );
     assert_eq!(
         refused(client, 1, &found.set),

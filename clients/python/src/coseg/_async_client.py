@@ -432,11 +432,12 @@ class AsyncCollection:
         """Removes a shape."""
         await self._call("remove_shape", shape=name)
 
-    async def portraits(self, names: Sequence[str], *, detail: str = "proxy") -> bytes:
+    async def portraits(self, names: Sequence[str], *, detail: str = "proxy", proposal: int = 0) -> bytes:
         """At most 256 shapes in the compact form that the viewer draws, which docs/viewer.md describes:
-        ``"proxy"``, ``"surface"`` or ``"functions"``."""
-        value = wire.portrait_detail(detail)
-        reply, raw = await self._call("get_portraits", shapes=names, detail=value)
+        ``"proxy"``, ``"surface"`` or ``"functions"``. With the number of a proposal, the proxy has its
+        classes in place of the labels."""
+        fields: dict[str, Any] = {"detail": wire.portrait_detail(detail), "proposal": proposal}
+        reply, raw = await self._call("get_portraits", shapes=names, **fields)
         return raw.file(reply.pack)
 
     # -- analysis -------------------------------------------------------------------------------

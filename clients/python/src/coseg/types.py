@@ -588,6 +588,8 @@ class Proposals:
     n_done: int
     #: Shapes that they divide.
     n_shapes: int
+    #: Names of those that are still there, in the order of their arrival.
+    shapes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
