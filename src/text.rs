@@ -48,6 +48,39 @@ pub fn counted(n: u64, noun: &str) -> String {
     format!("{n} {noun}{s}")
 }
 
+/// Estimates when something is done whose rest was counted again and again.
+///
+/// ```
+/// use coseg::text::Pace;
+/// use std::time::Duration;
+///
+/// let mut pace = Pace::default();
+/// assert_eq!(pace.left(100, Duration::from_secs(10)), None);
+/// // 40 in 2 s, so that 60 take 3 s.
+/// assert_eq!(pace.left(60, Duration::from_secs(12)), Some(Duration::from_secs(3)));
+/// // More has come: the estimate begins again.
+/// assert_eq!(pace.left(90, Duration::from_secs(13)), None);
+/// ```
+#[derive(Debug, Default, Clone)]
+pub struct Pace {
+    begin: Option<(u64, std::time::Duration)>,
+    last: u64,
+}
+
+impl Pace {
+    /// Returns the time that `n` things are expected to take; `None` if none was done since they
+    /// were counted first, or more have come. `now` is a time from any beginning.
+    pub fn left(&mut self, n: u64, now: std::time::Duration) -> Option<std::time::Duration> {
+        let began = self.begin.filter(|_| n <= self.last);
+        self.last = n;
+        let (of, begin) = *self.begin.insert(began.unwrap_or((n, now)));
+        (n > 0 && of > n).then(|| {
+            now.saturating_sub(begin)
+                .mul_f64(n as f64 / (of - n) as f64)
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::{counted, table};

@@ -9,11 +9,11 @@ use coseg::ipc::keys::{ClientKeys, KeyPair, read_public};
 use coseg::ipc::wire::{self, ErrorReason};
 use coseg::library::likely::{did_you_mean, likeliest};
 use coseg::library::shown;
-use coseg::text::counted;
+use coseg::text::{Pace, counted};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::Value;
 use std::io::IsTerminal as _;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Longest single wait in the daemon, so that an answer arrives well within the timeout.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
@@ -203,6 +203,7 @@ impl Session {
     /// Waits until the collection has no work left, as long as the daemon answers.
     pub(crate) fn wait_until_idle(&mut self, collection: &str) -> Result<(), CommandError> {
         let mut bar = None;
+        let (begin, mut pace) = (Instant::now(), Pace::default());
         loop {
             let request = wire::WaitIdleRequest {
                 collection: collection.to_owned(),
@@ -221,10 +222,13 @@ impl Session {
                 ));
                 spinner("waiting")
             });
+            let left = pace.left(reply.n_stale, begin.elapsed());
+            let left = left.map(|left| format!(", about {} s left", left.as_secs() + 1));
             bar.set_message(format!(
-                "{} to place, {} to relabel",
+                "{} to place, {} to relabel{}",
                 counted(reply.n_queued, "shape"),
-                reply.n_stale
+                reply.n_stale,
+                left.filter(|_| reply.n_queued == 0).unwrap_or_default()
             ));
             bar.tick();
         }

@@ -15,6 +15,7 @@
 
 mod access;
 mod answer;
+mod attention;
 mod bind;
 mod describing;
 mod dispatch;

@@ -370,7 +370,8 @@ fn relabel_remotely(
     let begin = Instant::now();
     let limit = Duration::from_secs(daemon.config().work.shape_seconds);
     let wanted = || begin.elapsed() < limit;
-    let work = Placing::Relabel(collection, most);
+    let first = daemon.work.attention().of(collection);
+    let work = Placing::Relabel(collection, most, &first);
     let report =
         library.with_exclusive(collection, || daemon.pool.place(collection, work, &wanted))?;
     match report {

@@ -1,6 +1,7 @@
 //! Accepted shapes that are not placed yet: their state in memory, and the messages to the
 //! placement queues of their collections.
 
+use crate::daemon::attention::Attention;
 use crate::daemon::memory::Reservation;
 use crate::daemon::progress::Progress;
 use crate::library::{Described, Failure, JobItem};
@@ -48,6 +49,8 @@ pub(crate) struct Work {
     changes: watch::Sender<u64>,
     /// The tasks that place, one for each queue.
     placing: Mutex<JoinSet<()>>,
+    /// What pages show. Locked for moments, by pages and by those who relabel.
+    attention: Mutex<Attention>,
 }
 
 impl Work {
@@ -57,7 +60,15 @@ impl Work {
             arrived: Notify::new(),
             changes: watch::Sender::new(0),
             placing: Mutex::new(JoinSet::new()),
+            attention: Mutex::new(Attention::default()),
         }
+    }
+
+    pub(crate) fn attention(&self) -> MutexGuard<'_, Attention> {
+        // A panic leaves it whole or without one name.
+        self.attention
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(crate) fn progress(&self) -> MutexGuard<'_, Progress<Step>> {

@@ -34,6 +34,22 @@ impl Library {
     /// There is no such collection, or the store fails. A shape that cannot be relabelled is an
     /// error once it is the first of the stale shapes.
     pub fn relabel_batch(&self, collection: Option<&str>, most: usize) -> Result<usize> {
+        self.relabel_first(collection, most, &[])
+    }
+
+    /// Does what [`Library::relabel_batch`] does, beginning with the stale ones of the shapes
+    /// `first`, in their order. Names of other shapes mean nothing. The final labels do not depend
+    /// on `first`.
+    ///
+    /// # Errors
+    /// Those of [`Library::relabel_batch`].
+    pub fn relabel_first(
+        &self,
+        collection: Option<&str>,
+        most: usize,
+        first: &[String],
+    ) -> Result<usize> {
+        let named = first;
         let wanted = collection.map(|name| self.collection_row(name));
         let wanted = wanted.transpose()?;
         let catalog = self.store.catalog();
@@ -57,18 +73,35 @@ impl Library {
                 let step = fit::step(collection, &self.store)?;
                 return Ok(usize::from(taken(&self.store, collection, step)?));
             }
-            let batch = self.batch(collection, first, most)?;
+            let batch = self.batch(collection, (first, named), most)?;
             relabel(&self.store, collection, &batch)
         })
     }
 
-    /// Returns the indices of up to `most` stale shapes, beginning with the one at `first`.
-    fn batch(&self, collection: &Collection, first: usize, most: usize) -> Result<Vec<usize>> {
+    /// Returns the indices of up to `most` stale shapes: those that are named, then those from the
+    /// one at `first` on.
+    fn batch(
+        &self,
+        collection: &Collection,
+        (first, named): (usize, &[String]),
+        most: usize,
+    ) -> Result<Vec<usize>> {
         let shapes = collection.shapes();
-        let others = (first + 1..shapes.len()).filter(|at| shapes[*at].stale);
+        let catalog = self.store.catalog();
+        let mut wanted = catalog.read(|r| -> Result<Vec<usize>> {
+            let mut found = Vec::new();
+            for name in named {
+                let row = r.shape_by_name(collection.id(), name)?;
+                let at = row.and_then(|row| collection.position(row.id));
+                found.extend(at.filter(|at| shapes[*at].stale && !found.contains(at)));
+            }
+            Ok(found)
+        })?;
+        let others = (first..shapes.len()).filter(|at| shapes[*at].stale && !wanted.contains(at));
+        let others: Vec<usize> = others.take(most).collect();
+        wanted.extend(others);
         let (mut batch, mut n_polygons) = (Vec::new(), 0);
-        for at in [first].into_iter().chain(others).take(most) {
-            let catalog = self.store.catalog();
+        for at in wanted.into_iter().take(most) {
             let row = catalog.read(|r| r.shape(shapes[at].id))?;
             n_polygons += row.map_or(0, |row| row.n_polygons);
             if n_polygons > MAX_BATCH_POLYGONS && !batch.is_empty() {

@@ -112,7 +112,7 @@ impl Library {
         Ok(found.into_iter().map(|f| f.1).collect())
     }
 
-    /// Returns the arrays of a shape with the class of each face of its proxy in a proposal, from 0,
+    /// Returns the arrays of a shape, the class of each face of its proxy in a proposal, from 0,
     /// and the version of its labels in force.
     ///
     /// # Errors

@@ -19,6 +19,13 @@ type Ended = (
     Vec<Event>,
 );
 
+/// Names of the shapes that wait to be relabelled, in the order of their arrival.
+fn waiting(library: &Library) -> Vec<String> {
+    let all = library.shapes(COLLECTION, 0, 1_000, None).unwrap();
+    let stale = all.into_iter().filter(|s| s.stale);
+    stale.map(|s| s.name).collect()
+}
+
 fn settle(library: &Library, batch: usize) -> Vec<usize> {
     let mut batches = Vec::new();
     loop {
@@ -75,7 +82,7 @@ fn shapes_that_wait_are_relabelled_together() {
         rotate: false,
     };
     let shapes = family(Family::Pliers, 34, MAX_REPRESENTATIVES as u32 + 4, &options);
-    let relabelled = |batch: usize| {
+    let corrected = || {
         let folder = tempfile::tempdir().unwrap();
         let library = Library::open(folder.path()).unwrap();
         let spec = CollectionSpec {
@@ -90,6 +97,10 @@ fn shapes_that_wait_are_relabelled_together() {
         library
             .correct(COLLECTION, &shapes[0].name, &whole, None)
             .unwrap();
+        (folder, library)
+    };
+    let relabelled = |batch: usize| {
+        let (_folder, library) = corrected();
         (settle(&library, batch), all_labels(&library))
     };
     let (batches, labels) = relabelled(3);
@@ -97,4 +108,17 @@ fn shapes_that_wait_are_relabelled_together() {
     let (single, of_single) = relabelled(1);
     assert_eq!(single[single.len() - 4..], [1; 4]);
     assert_eq!(labels, of_single);
+
+    // What is shown comes first, and the labels are the same.
+    let (_folder, library) = corrected();
+    while waiting(&library).len() > 4 {
+        assert!(library.relabel_first(Some(COLLECTION), 3, &[]).unwrap() > 0);
+    }
+    let all = waiting(&library);
+    let shown = ["nobody", &all[3], &shapes[0].name, &all[2], &all[3]].map(str::to_owned);
+    for (n, left) in [(1, &all[..3]), (1, &all[..2]), (3, &[])] {
+        assert!(library.relabel_first(Some(COLLECTION), n, &shown).unwrap() > 0);
+        assert_eq!(waiting(&library), left);
+    }
+    assert_eq!(all_labels(&library), labels);
 }

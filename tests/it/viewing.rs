@@ -234,6 +234,13 @@ fn a_page_lists_chooses_and_links() {
     assert_eq!(post("unlink", &unlink).0, 404);
     let listed = read("/api/links?collection=skittles");
     assert_eq!(listed["links"], serde_json::json!([]));
+    // A page says what it shows, of any collection, but not of more than fit on a screen.
+    read("/api/library?collection=skittles&first=b&first=nobody");
+    read("/api/library?collection=nowhere&first=b");
+    let many = "&first=a".repeat(65);
+    let (status, text) = get(address, &format!("/api/library?collection=skittles{many}"));
+    assert_eq!(status, 400);
+    assert!(text.contains("65 shapes, the limit is 64"), "{text}");
 }
 
 #[test]

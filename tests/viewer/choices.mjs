@@ -289,6 +289,34 @@ async function linkTests({ test, open, shot, url, finish }) {
   });
 }
 
+async function attentionTests({ test, open, url, finish }) {
+  await test("the page says what it shows, and how long others take", async () => {
+    const [first, second] = names();
+    const page = await open(`${url}#${C}/${second}`);
+    await shown(page, second, "labels");
+    const asked = await page.waitForRequest((request) => {
+      const query = new URL(request.url()).searchParams;
+      return query.get("collection") === C && query.getAll("first")[0] === second;
+    });
+    const shows = new URL(asked.url()).searchParams.getAll("first");
+    assert.ok(shows.includes(first), `${shows}`);
+    assert.equal(new Set(shows).size, shows.length);
+    const left = [9, 6, 3];
+    await page.route(`${url}api/library*`, async (route) => {
+      const json = await (await route.fetch()).json();
+      json.collections.find((c) => c.name === C).n_stale = left.shift() ?? 0;
+      await route.fulfill({ json });
+    });
+    for (const text of [/^9 to relabel$/, /^6 to relabel · about \d+ s$/, /^live$/])
+      await page.waitForFunction(
+        (source) => new RegExp(source).test(document.querySelector("#state").textContent),
+        text.source,
+      );
+    await page.unrouteAll({ behavior: "ignoreErrors" });
+    await finish(page);
+  });
+}
+
 export async function choiceTests(kit) {
   const finish = async (page) => {
     assert.deepEqual(page.faults, []);
@@ -296,4 +324,5 @@ export async function choiceTests(kit) {
   };
   await proposalTests({ ...kit, finish });
   await linkTests({ ...kit, finish });
+  await attentionTests({ ...kit, finish });
 }

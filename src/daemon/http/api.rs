@@ -7,6 +7,7 @@ use super::hands::{Reserved, full};
 use super::questions::{AnswerBody, ReviewBody, answered, question};
 use super::runs::{Run, labels_of};
 use super::server::Server;
+use crate::daemon::attention::MAX_SHOWN;
 use crate::ipc::convert;
 use crate::ipc::frames::{FrameReader, FrameWriter};
 use crate::ipc::json;
@@ -26,7 +27,10 @@ const MAX_PORTRAITS: u32 = 64;
 pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]) -> Answer {
     let query = Query(query);
     match path {
-        "library" => library(server).await,
+        "library" => {
+            note_shown(server, &query)?;
+            library(server).await
+        }
         "collection" => collection(server, query.text("collection")?).await,
         "portraits" => portraits(server, &query).await,
         "proposals" => choices::proposals(server, query.text("collection")?).await,
@@ -86,6 +90,25 @@ pub(super) async fn read(server: &Server, path: &str, query: &[(String, String)]
 fn unknown(path: &str) -> wire::Error {
     let text = format!("there is no /api/{path}");
     convert::error(wire::ErrorCode::NotFound, ErrorReason::UnknownRequest, text)
+}
+
+/// Notes which shapes of a collection the page shows, so that these are relabelled first.
+fn note_shown(server: &Server, query: &Query<'_>) -> Result<(), wire::Error> {
+    let Some(collection) = query.find("collection") else {
+        return Ok(());
+    };
+    let shown = query.0.iter().filter(|(key, _)| key == "first");
+    let shown: Vec<String> = shown.map(|(_, name)| name.clone()).collect();
+    if shown.len() > MAX_SHOWN {
+        let message = format!(
+            "first names {} shapes, the limit is {MAX_SHOWN}",
+            shown.len()
+        );
+        let reason = ErrorReason::FieldRange;
+        return Err(convert::field_error(reason, "first", message));
+    }
+    server.daemon.work.attention().shows(collection, shown);
+    Ok(())
 }
 
 async fn library(server: &Server) -> Answer {

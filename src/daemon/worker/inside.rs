@@ -268,7 +268,9 @@ fn place(header: &Value, open: &mut Opened, poisoned: bool) -> Value {
         let library = opened(header, open)?;
         if let Some(collection) = header["relabel"].as_str() {
             let most = header["most"].as_u64().unwrap_or(1) as usize;
-            let n_shapes = library.relabel_batch(Some(collection), most)?;
+            let first = header["first"].as_array().into_iter().flatten();
+            let first: Vec<String> = first.filter_map(|n| n.as_str()).map(String::from).collect();
+            let n_shapes = library.relabel_first(Some(collection), most, &first)?;
             return Ok(report::relabelled(n_shapes));
         }
         if let Some(collection) = header["propose"].as_str() {

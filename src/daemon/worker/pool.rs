@@ -31,8 +31,8 @@ pub(crate) enum Placing<'a> {
     /// Place the shape of this ticket ([`crate::Library::placement_ticket`]), whose file has this
     /// number of bytes.
     Place(&'a Value, u64),
-    /// Relabel at most so many stale shapes of a collection.
-    Relabel(&'a str, usize),
+    /// Relabel at most so many stale shapes of a collection, those with these names first.
+    Relabel(&'a str, usize, &'a [String]),
     /// Make a step towards the proposals of a collection.
     Propose(&'a str),
 }
@@ -172,8 +172,9 @@ impl Pool {
                 let reading = Limits::to_describe(n_bytes);
                 memory += 2 * reading;
             }
-            Placing::Relabel(collection, most) => {
+            Placing::Relabel(collection, most, first) => {
                 header["relabel"] = json!(collection);
+                header["first"] = json!(first);
                 header["most"] = json!(most);
             }
             Placing::Propose(collection) => header["propose"] = json!(collection),

@@ -118,6 +118,8 @@ class EmbeddedSource {
 const BUSY = 503;
 const BUSY_MS = 300;
 const MAX_TRIES = 4;
+/** Most shapes that the page names to the daemon as those that it shows. */
+const MAX_SHOWN = 48;
 
 /** Reads from the daemon that serves this page. */
 class LiveSource {
@@ -154,8 +156,10 @@ class LiveSource {
     return response.json();
   }
 
-  library() {
-    return this.json("library");
+  /** Returns the library. Shapes that the page shows, the first ones, are relabelled first. */
+  library(collection, names = []) {
+    const first = names.slice(0, MAX_SHOWN).map((name) => ["first", name]);
+    return this.json("library", collection ? [["collection", collection], ...first] : []);
   }
 
   collection(name) {

@@ -247,6 +247,13 @@ class Gallery {
     card.setAttribute("aria-current", String(app.selected === shape.name));
   }
 
+  /** Returns the names of the shapes in sight, that of the large one first. */
+  inSight() {
+    const seen = [...this.root.children].filter((card) => card.inSight && card.checkVisibility());
+    const names = seen.map((card) => card.dataset.name);
+    return [...new Set([this.app.selected, ...names].filter(Boolean))];
+  }
+
   describeAll() {
     for (const [name, card] of this.cards) {
       const shape = this.app.shape(name);

@@ -3,21 +3,39 @@
 /** Milliseconds between polls of a live library. */
 const LOOK_MS = 1_500;
 
+/** Estimates when something is done whose rest is counted again and again. */
+class Pace {
+  /**
+   * Returns how many seconds `n` things are expected to take; null if none was done since they were
+   * counted first, or more have come.
+   */
+  left(n, now) {
+    if (!this.begin || n > this.last) this.begin = { n, now };
+    this.last = n;
+    const done = this.begin.n - n;
+    return n > 0 && done > 0 ? (((now - this.begin.now) / 1000) * n) / done : null;
+  }
+}
+
 class Live {
   constructor(app) {
     this.app = app;
+    this.pace = new Pace();
   }
 
   async look() {
     const { app } = this;
     try {
-      const library = await app.source.library();
+      const library = await app.source.library(app.name, app.gallery.inSight());
       app.setLibrary(library);
       const names = library.collections.map((c) => c.name);
       const mine = library.collections.find((c) => c.name === app.name);
       const busy = [];
       if (mine?.n_queued) busy.push(`${mine.n_queued} to place`);
       if (mine?.n_stale) busy.push(`${mine.n_stale} to relabel`);
+      const left = this.pace.left(mine?.n_stale ?? 0, performance.now());
+      // Shapes that are still to be placed may make others stale.
+      if (left !== null && !mine.n_queued) busy.push(`about ${Math.ceil(left)} s`);
       this.status(busy.join(" · ") || "live", busy.length ? "work" : "");
       if (!mine && names.length) await app.go({ collection: names[0], shape: null });
       else if (mine && app.loaded && this.differs(mine)) await this.reload();
