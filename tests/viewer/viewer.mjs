@@ -115,6 +115,14 @@ if (what === "many") {
     await shot(page, "map");
     assert.deepEqual(page.faults, []);
     await page.context().close();
+    const { set } = coseg("proposals", "chairs");
+    const size = { width: 1280, height: 690 };
+    const many = await open(`${url}#chairs?show=proposals`, size);
+    await many.waitForSelector(`#proposals[data-ready="${set}"]`);
+    await many.evaluate(() => document.activeElement.blur());
+    await shot(many, "proposals");
+    assert.deepEqual(many.faults, []);
+    await many.context().close();
   });
 } else if (what === "empty") {
   await test("an empty library says what to do", async () => {
