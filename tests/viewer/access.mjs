@@ -180,9 +180,9 @@ export async function accessTests({ test, open, coseg, shot, url, file, names })
     await shown(page, second, "eigen");
     assert.equal(await active(), "eigen");
     await page.keyboard.press("End");
-    await shown(page, second, "ask");
+    await shown(page, second, "link");
     await page.keyboard.press("ArrowRight");
-    assert.equal(await active(), "ask");
+    assert.equal(await active(), "link");
     await page.keyboard.press("Home");
     await shown(page, second, "labels");
     await page.focus("#scene");
