@@ -22,8 +22,10 @@ ROOT = HERE.parents[1]
 PACKAGE = HERE / "coseg_blender"
 #: Pythons of Blender: 4.2 to 5.0 have 3.11, 5.1 has 3.13.
 PYTHONS = ("3.11", "3.13")
-#: What the client imports, as clients/python/pyproject.toml says.
-REQUIREMENTS = ("pyzmq>=25", "protobuf>=6.31.1,<8")
+#: What the client imports, as clients/python/pyproject.toml says. pyzmq 27 has a wheel of the stable ABI for
+#: 3.13 beside one of 3.11 alone, of which Blender takes the latter to say that 3.13 is not served; 26 has one
+#: for each.
+REQUIREMENTS = ("pyzmq>=26.2,<27", "protobuf>=6.31.1,<8")
 #: Blender's names of platforms, and pip's. The daemon runs on Linux; others connect to one.
 PLATFORMS = {
     "linux-x64": ("manylinux_2_28_x86_64", "manylinux2014_x86_64"),

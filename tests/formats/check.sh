@@ -28,11 +28,10 @@ done
 "$work/venv/bin/python" "$here/check.py" "$work/in" "$work/out"
 node "$work/validate.mjs" "$work/out/parts.json" "$work"/out/*.glb
 # The package is large, so that it is not installed for this; COSEG_BPY names a Python that has it.
-blender=${COSEG_BPY:-python3}
-if "$blender" -c 'import bpy' 2>/dev/null; then
-    "$blender" "$here/blender.py" "$work/out"
+if [ -n "${COSEG_BPY:-}" ]; then
+    "$COSEG_BPY" "$here/blender.py" "$work/out"
 else
-    echo "skipped: reading with Blender needs a Python with bpy, such as COSEG_BPY=venv/bin/python3"
+    echo "skipped: reading with Blender needs COSEG_BPY, a Python with bpy: clients/blender/bpy.sh makes one"
 fi
 
 # Every messy file through the socket, and spoilt ones with their reasons.

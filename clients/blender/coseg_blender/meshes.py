@@ -7,7 +7,6 @@ belong to the faces that a person edits and modifiers make others of them, and a
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,6 @@ import bpy
 import numpy as np
 
 import coseg
-from coseg._instances import instance_numbers
 from coseg._polygons import as_off, backwards
 
 #: The attribute of faces that holds labels; -1 for none.
@@ -28,8 +26,6 @@ SHAPE, COLLECTION, FACES = "coseg_shape", "coseg_collection", "coseg_faces"
 #: Property of a material: the label that it shows.
 LABEL = "coseg_label"
 UNLABELLED = (0.5, 0.5, 0.5)
-#: The layer of faces that tells parts while a mesh is separated.
-PART = "coseg_part"
 
 
 class Unusable(coseg.CosegError):
@@ -308,51 +304,3 @@ def set_materials(obj: bpy.types.Object, slots: np.ndarray[Any, Any]) -> None:
         return
     obj.data.polygons.foreach_set("material_index", slots.astype(np.int32))
     obj.data.update()
-
-
-def separate(
-    obj: bpy.types.Object, found: np.ndarray[Any, Any], labels: dict[int, coseg.Label]
-) -> bpy.types.Collection:
-    """A collection with an object for each part instance, such as ``leg.001``; the mesh itself stays."""
-    mesh = editable(obj)
-    if len(mesh.polygons) != len(found):
-        raise Unusable(f"{obj.name} has {len(mesh.polygons)} faces, but {len(found)} labels: send it again")
-    sent = arrays(obj)
-    numbers = instance_numbers(sent.vertices, sent.counts, sent.corners, found.astype(np.int64))
-    target = bpy.data.collections.new(f"{obj.name} parts")
-    bpy.context.scene.collection.children.link(target)
-    pairs, of_face = np.unique(np.stack([found, numbers]), axis=1, return_inverse=True)
-    whole = bmesh.new()
-    whole.from_mesh(mesh)
-    layer = whole.faces.layers.int.new(PART)
-    for face, part in zip(whole.faces, of_face.reshape(-1).tolist(), strict=True):
-        face[layer] = part
-    for (label, number), part in zip(pairs.T.tolist(), divided(whole, 0, pairs.shape[1]), strict=True):
-        name = f"{name_of(label, labels)}.{number:03}"
-        data = bpy.data.meshes.new(name)
-        part.faces.layers.int.remove(part.faces.layers.int[PART])
-        part.to_mesh(data)
-        part.free()
-        for slot in mesh.materials:
-            data.materials.append(slot)
-        piece = bpy.data.objects.new(name, data)
-        piece.matrix_world = obj.matrix_world
-        piece["label"], piece["label_name"], piece["instance"] = label, name_of(label, labels), number
-        target.objects.link(piece)
-    return target
-
-
-def divided(mesh: bmesh.types.BMesh, low: int, high: int) -> Iterator[bmesh.types.BMesh]:
-    """The parts from ``low`` to below ``high`` of a mesh that has these, by halves: each face is copied
-    as often as halving takes, and not once for each part."""
-    if high - low == 1:
-        yield mesh
-        return
-    middle = (low + high) // 2
-    second = mesh.copy()
-    for half, is_first in ((mesh, True), (second, False)):
-        layer = half.faces.layers.int[PART]
-        others = [face for face in half.faces if (face[layer] < middle) != is_first]
-        bmesh.ops.delete(half, geom=others, context="FACES")
-    yield from divided(mesh, low, middle)
-    yield from divided(second, middle, high)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import bpy
@@ -11,6 +12,7 @@ import coseg
 from coseg.types import Question
 
 from . import meshes
+from .parts import Separation
 from .session import current
 
 #: Labels that a part has with less probability are not named in a question.
@@ -454,7 +456,6 @@ class Separate(Step):
 
     bl_idname = "coseg.separate"
     bl_label = "Separate Parts"
-    bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -462,8 +463,9 @@ class Separate(Step):
 
     def begin(self, context: Any) -> None:
         by_id = {label.id: label for label in current.labels}
-        for obj in selected_meshes(context):
-            meshes.separate(obj, labels_of(obj), by_id)
+        # A mesh that has no labels is reported before any is separated.
+        for one in [Separation(obj, labels_of(obj)) for obj in selected_meshes(context)]:
+            current.submit(f"separating {one.name}", one.number, partial(one.steps, labels=by_id))
 
 
 class OwnMaterials(Step):

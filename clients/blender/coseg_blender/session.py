@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +25,8 @@ from coseg.types import Question
 
 #: Seconds between looks at work that is under way.
 INTERVAL = 0.1
+#: Seconds between steps of Blender's own work, in which it draws and takes input, and of such steps.
+PAUSE, SLICE = 0.01, 0.05
 #: Seconds that a daemon may take to start.
 STARTUP = 30.0
 #: Seconds that Blender waits at its end for work that is under way.
@@ -86,10 +88,15 @@ class Session:
         self.labels: list[coseg.Label] = []
         self._process: subprocess.Popen[bytes] | None = None
         self._worker: Worker | None = None
-        self._waiting: list[tuple[str, Future[Any], Callable[[Any], None]]] = []
+        self._waiting: list[tuple[str, Future[Any], Callable[[Any], Iterator[str] | None]]] = []
+        #: What is left to do with the first result, if that is done in steps.
+        self._steps: Iterator[str] | None = None
 
-    def submit(self, doing: str, work: Callable[[], Any], done: Callable[[Any], None]) -> None:
-        """Does ``work`` in the thread, then ``done`` with its result in Blender's."""
+    def submit(
+        self, doing: str, work: Callable[[], Any], done: Callable[[Any], Iterator[str] | None]
+    ) -> None:
+        """Does ``work`` in the thread, then ``done`` with its result in Blender's. An iterator that this
+        returns is taken step by step, with time for Blender between them; it yields how far it is."""
         if self._worker is None:
             self._worker = Worker()
         self.error = self.message = ""
@@ -101,17 +108,21 @@ class Session:
 
     def _tick(self) -> float | None:
         self.pump()
-        return INTERVAL if self._waiting else None
+        if not self._waiting:
+            return None
+        return INTERVAL if self._steps is None else PAUSE
 
     def pump(self) -> bool:
         """Takes up what has finished; whether anything is still under way."""
-        while self._waiting and self._waiting[0][1].done():
-            _, future, done = self._waiting.pop(0)
-            self.progress = ""
+        end = time.monotonic() + SLICE
+        while self._waiting and self._waiting[0][1].done() and time.monotonic() < end:
             try:
-                done(future.result())
+                if self._step():
+                    continue
             except Exception as e:  # An error of any kind is shown, and what comes next goes on.
                 self.error = str(e) or type(e).__name__
+            self._waiting.pop(0)
+            self._steps, self.progress = None, ""
             if bpy.ops.ed.undo_push.poll():
                 # Otherwise the next undo would take labels away together with what a person did.
                 bpy.ops.ed.undo_push(message="coseg")
@@ -120,6 +131,16 @@ class Session:
             for area in window.screen.areas:
                 area.tag_redraw()
         return bool(self._waiting)
+
+    def _step(self) -> bool:
+        """Takes up the first result, or a step of that; whether there are more steps."""
+        if self._steps is None:
+            _, future, done = self._waiting[0]
+            self._steps = done(future.result())
+        if self._steps is None:
+            return False
+        self.progress = next(self._steps, "")
+        return self.progress != ""
 
     def connect(self, endpoint: str, folder: str) -> None:
         """Connects to the daemon at ``endpoint``, or starts one with its library in ``folder``. Runs in the

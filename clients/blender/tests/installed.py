@@ -7,6 +7,7 @@ import os
 import sys
 import tempfile
 import time
+import zipfile
 from pathlib import Path
 
 with tempfile.TemporaryDirectory() as folder:
@@ -14,6 +15,12 @@ with tempfile.TemporaryDirectory() as folder:
     import bpy
 
     bpy.ops.preferences.addon_enable(module="bl_pkg")
+    from bl_pkg.bl_extension_utils import python_versions_from_wheels
+
+    with zipfile.ZipFile(sys.argv[1]) as archive:
+        wheels = [name for name in archive.namelist() if name.endswith(".whl")]
+    # Blender refuses an extension whose wheels do not name its Python.
+    assert python_versions_from_wheels(wheels) == {(3, 11), (3, 13)}, wheels
     done = bpy.ops.extensions.package_install_files(
         filepath=str(Path(sys.argv[1]).resolve()), repo="user_default", enable_on_install=True
     )

@@ -279,7 +279,7 @@ def test_parts_become_objects() -> None:
     current.library.collection("separated").correct("whole", labels)
     current.library.collection("separated").name_label(0, "leg")
     run(bpy.ops.coseg.refresh)
-    assert bpy.ops.coseg.separate() == {"FINISHED"}
+    run(bpy.ops.coseg.separate)
     parts = bpy.data.collections["whole parts"].objects
     # Blender numbers names that are taken.
     found = {part.name[: part.name.index(".") + 4]: len(part.data.polygons) for part in parts}
@@ -288,6 +288,58 @@ def test_parts_become_objects() -> None:
     }
     assert sum(found.values()) == len(obj.data.polygons) == 37
     assert all(part["label"] == 0 for part in parts if part.name.startswith("leg"))
+
+
+def striped(n: int, n_stripes: int) -> Any:
+    """A grid of n × n faces with labels in stripes, which no daemon has given."""
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=n, y_subdivisions=n)
+    obj = bpy.context.view_layer.objects.active
+    meshes.write(obj, meshes.ATTRIBUTE, np.repeat(np.arange(n) * n_stripes // n, n))
+    return obj
+
+
+def test_separating_leaves_time_to_draw() -> None:
+    fresh_scene(collection="large")
+    obj = striped(300, 8)
+    begin = time.monotonic()
+    assert bpy.ops.coseg.separate() == {"FINISHED"}
+    assert current.doing == f"separating {obj.name}"
+    slices = [time.monotonic() - begin]
+    seen = set()
+    while True:
+        begin = time.monotonic()
+        goes_on = current.pump()
+        slices.append(time.monotonic() - begin)
+        seen.add(current.progress)
+        if not goes_on:
+            break
+        time.sleep(0.001)
+    assert not current.error and {"0 of 8 parts", "4 of 8 parts"} <= seen
+    assert len(bpy.data.collections[f"{obj.name} parts"].objects) == 8
+    # At once it would all be one slice.
+    assert max(slices) < sum(slices) / 3, slices
+
+
+def test_what_happens_to_a_mesh_while_it_is_separated_is_reported() -> None:
+    fresh_scene(collection="busy")
+    obj, other = striped(10, 2), striped(10, 3)
+    select(obj, other)
+    assert bpy.ops.coseg.separate() == {"FINISHED"}
+    obj.data.flip_normals()
+    settle()
+    assert f"{obj.name} was edited while" in current.error
+    # What waits goes on.
+    assert len(bpy.data.collections[f"{other.name} parts"].objects) == 3
+    select(obj)
+    assert bpy.ops.coseg.separate() == {"FINISHED"}
+    bpy.data.objects.remove(obj)
+    settle()
+    assert "was removed or renamed" in current.error
+    bare = chair("bare")
+    select(bare, other)
+    n = len(bpy.data.collections)
+    run(bpy.ops.coseg.separate, fails="bare has no labels")
+    assert len(bpy.data.collections) == n
 
 
 def test_what_is_sent_of_instances_modifiers_shape_keys_and_transforms() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import struct
 import subprocess
+import sys
 import zlib
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -87,6 +90,21 @@ def test_pictures_show_the_mesh_and_its_values(tmp_path: Path) -> None:
     assert repr(mesh.plot(backend="png")) == "Picture(480 x 480)"
     with pytest.raises(coseg.GeometryError, match="backend"):
         mesh.plot(backend="paper")
+
+
+def test_plots_open_a_window_where_there_can_be_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    window = MagicMock()
+    monkeypatch.setitem(sys.modules, "polyscope", window)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: window)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    mesh = sphere(1)
+    if sys.platform == "linux":
+        assert repr(mesh.plot()) == "Picture(480 x 480)" and not window.show.called
+    monkeypatch.setenv("DISPLAY", ":7")
+    assert mesh.plot(mesh.vertices[:, 0]) is window.show.return_value
+    _, kept = window.register_surface_mesh.call_args.args[1:]
+    assert np.array_equal(kept, mesh.faces)
 
 
 def test_notebooks_show_html() -> None:

@@ -77,17 +77,21 @@ export function checkResolution(
 }
 
 export function pointOptions(
-  { landmarks = [], orientation, k = 0, alternative = false }: Points,
+  { landmarks = [], orientation, k = 0, alternative = false, landmarkResolution }: Points,
   resolution: Resolution,
 ) {
+  const of = landmarkResolution ?? (resolution === "proxy" ? "proxy" : "input");
+  // Not all callers have types.
+  if (of !== "input" && of !== "proxy") {
+    throw new CosegError(`landmarkResolution is ${JSON.stringify(of)}, but must be "input" or "proxy"`);
+  }
   const wanted = { keep: MapOrientation.KEEP, reverse: MapOrientation.REVERSE };
   return {
     landmarks: landmarks.map(([from, to]) => ({ from, to })),
     orientation: orientation === undefined ? MapOrientation.UNSPECIFIED : wanted[orientation],
     k,
     alternative,
-    landmarkResolution:
-      landmarks.length === 0 ? WireResolution.UNSPECIFIED : wireResolution(resolution === "proxy" ? "proxy" : "input"),
+    landmarkResolution: landmarks.length === 0 ? WireResolution.UNSPECIFIED : wireResolution(of),
   };
 }
 

@@ -132,6 +132,9 @@ export interface Added {
  */
 export type Resolution = "input" | "input_faces" | "proxy";
 
+/** Which vertices landmarks are: of the meshes as sent, or of the working meshes. */
+export type LandmarkResolution = "input" | "proxy";
+
 /** Eigenpairs on a shape's working mesh, scaled to area 1; rows as requested. */
 export interface Spectrum {
   /** (k), ascending, 0 included. In input units: divide by `area`. */
@@ -193,10 +196,16 @@ export interface FunctionalMap {
 /** Options of a map between points. */
 export interface Points {
   /**
-   * Corresponding vertices, `from` first: of the meshes as sent, or of the working meshes if the
-   * resolution is "proxy".
+   * Corresponding vertices, `from` first: of the meshes as sent or of the working meshes, as
+   * `landmarkResolution` says.
    */
   readonly landmarks?: readonly (readonly [number, number])[];
+  /**
+   * Which vertices landmarks are: of the meshes as sent ("input") or of the working meshes
+   * ("proxy"), whatever the rows of the reply are of. Without it "proxy" if the resolution is
+   * "proxy", else "input".
+   */
+  readonly landmarkResolution?: LandmarkResolution;
   /**
    * The orientation of a map between shapes that have a reflection; by default the map keeps
    * orientation unless it is then much worse.

@@ -147,6 +147,32 @@ test("arrays are of the mesh as sent", async () => {
   await assert.rejects(chairs.hks(a, { resolution: "output" as "input" }), /resolution is output/);
 });
 
+test("landmarks are vertices of either mesh", async () => {
+  const [a, b] = names as [string, string];
+  const chairs = lib.collection("coarse");
+  const { p2p21 } = await chairs.map(a, b, { landmarks: [], resolution: "proxy" });
+  const landmarks = [0, 100, 200].map((v) => [p2p21[v]!, v] as const);
+  // Whatever the rows of the reply are of.
+  const ofProxy = await chairs.map(a, b, { landmarks, landmarkResolution: "proxy" });
+  const same = await chairs.map(a, b, { landmarks, resolution: "proxy" });
+  assert.deepEqual([ofProxy.resolution, same.resolution], ["input", "proxy"]);
+  assert.deepEqual(ofProxy.c12.data, same.c12.data);
+  const ofFiles = await chairs.map(a, b, { landmarks, resolution: "proxy", landmarkResolution: "input" });
+  assert.notDeepEqual(ofFiles.c12.data, same.c12.data);
+  const { nVertices: n, nProxyVertices: nProxy } = (await chairs.shape(a)).report!;
+  await assert.rejects(
+    chairs.map(a, b, { landmarks: [[n - 1, 0]], landmarkResolution: "proxy" }),
+    new RegExp(`vertex ${n - 1}.* has ${nProxy}`),
+  );
+  const options = { landmarks, resolution: "input", landmarkResolution: "proxy" } as const;
+  const ones = await chairs.transfer(new Float32Array(n).fill(1), a, b, options);
+  assert.ok(ones.every((v) => Number.isNaN(v) || Math.abs(v - 1) < 1e-5) && ones.some((v) => v > 0));
+  await assert.rejects(
+    chairs.map(a, b, { landmarks, landmarkResolution: "input_faces" as "input" }),
+    /landmarkResolution is "input_faces", but must be "input" or "proxy"/,
+  );
+});
+
 test("refusals are typed", async () => {
   await assert.rejects(chairs.labels("nobody"), (e) => {
     assert.ok(e instanceof coseg.NotFound && e instanceof coseg.Refused && e.name === "NotFound");

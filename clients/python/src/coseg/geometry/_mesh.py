@@ -231,7 +231,7 @@ class Mesh:
         """Shows the mesh, coloured by ``values`` (n,), (m,) or (n_polygons,).
 
         ``backend`` is ``"polyscope"``, ``"pyvista"`` or ``"png"``; by default the first of these
-        that is installed. The last one returns a :class:`Picture`.
+        that is installed, or ``"png"`` where there is no screen. That one returns a :class:`Picture`.
         """
         from coseg.geometry._picture import plot
 

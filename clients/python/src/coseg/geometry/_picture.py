@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,11 +94,16 @@ def _colours(mesh: Mesh, values: ArrayLike | None) -> Doubles:
     return ramp(doubles(at_faces, "values"))
 
 
+def _has_screen() -> bool:
+    """Whether a window can be opened; without X11 and Wayland those packages fail on Linux."""
+    return sys.platform != "linux" or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
 def plot(mesh: Mesh, values: ArrayLike | None, backend: str | None) -> Any:
     """Shows the mesh in a window or a notebook; see :meth:`Mesh.plot`."""
     if backend is None:
-        installed = (n for n in ("polyscope", "pyvista") if importlib.util.find_spec(n))
-        backend = next(installed, "png")
+        windows = ("polyscope", "pyvista") if _has_screen() else ()
+        backend = next((n for n in windows if importlib.util.find_spec(n)), "png")
     if backend == "png":
         return picture(mesh, values, (480, 480))
     colours = _colours(mesh, values) / 255.0
