@@ -137,7 +137,7 @@ fn description(view: &DescriptionView<'_>) -> Checked {
         format!("its descriptors and signature have {found:?} columns")
     })?;
     let found = (view.n_eigenvectors, view.eigenvalues.len());
-    require(found.0 == found.1 && found.0 <= n, || {
+    require(found.0 > 0 && found.0 <= found.1, || {
         format!(
             "it has {} eigenvectors of {n} values for {} eigenvalues",
             found.0, found.1
