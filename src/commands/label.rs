@@ -96,9 +96,9 @@ pub(crate) fn run(args: &LabelMeshes, global: &Global) -> Outcome {
             0 => String::new(),
             n => format!(", {n} failed"),
         };
-        let meshes = counted(n_labelled as u64, "mesh");
+        let shapes = counted(n_labelled as u64, "shape");
         let out = args.out.display();
-        eprintln!("{meshes} labelled{failed} in {seconds:.1} s, written to {out}");
+        eprintln!("{shapes} labelled{failed} in {seconds:.1} s, written to {out}");
     }
     Ok(n_failed == 0)
 }

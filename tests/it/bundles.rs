@@ -1,5 +1,5 @@
-//! Opens bundles that are cut, changed or forged: each is an error that says what is wrong, and none
-//! is a panic.
+//! Opens bundles that are cut, changed or forged: each is an error that says what is wrong, never
+//! a panic.
 
 use crate::pipeline::{COLLECTION, file, library};
 use coseg::library::{Bundle, BundleError, Correction, Up, write_bundle};
