@@ -1,5 +1,6 @@
 //! Parses the command line into one command with typed flags.
 
+mod bundles;
 mod care;
 mod maps;
 mod corrections;
@@ -8,6 +9,7 @@ mod looking;
 mod proposals;
 mod questions;
 
+pub(crate) use bundles::{LabelMeshes, Publish};
 pub(crate) use care::{Cancel, Jobs, Keys, KeysCommand, Restore, Retry, Snapshot, Stop};
 pub(crate) use corrections::{Correct, Merge, Render, Split, Suggest, Undo};
 pub(crate) use links::{LinkParts, Links, Unlink};
@@ -123,6 +125,10 @@ pub(crate) enum Command {
     Labels(Labels),
     /// Write labels, or coloured meshes, of a collection to a folder
     Export(Export),
+    /// Write all that labels new shapes of a collection to one file, for `coseg label`
+    Publish(Publish),
+    /// Label meshes by a file of `coseg publish`, without a daemon
+    Label(LabelMeshes),
     /// Label the meshes of OpenUSD assets, or correct labels there (needs the package coseg[usd])
     #[command(disable_help_flag = true)]
     Usd(Usd),

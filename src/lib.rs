@@ -31,7 +31,7 @@ pub mod config;
 pub mod viewer;
 pub mod daemon;
 
-pub use library::Library;
+pub use library::{Bundle, Library, label};
 
 /// Runs the example of the README as a test.
 #[cfg(doctest)]

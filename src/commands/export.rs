@@ -53,6 +53,11 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         Ok::<_, CommandError>(())
     };
     let mut own = OwnMaterials::beside(&styles);
+    let form = Form {
+        format: args.format,
+        materials: args.materials,
+        instances: args.instances,
+    };
     let progress = bar(shapes.len() as u64);
     for shape in &shapes {
         progress.set_message(shape.clone());
@@ -73,7 +78,7 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
         } else {
             let original = Original::receive(&mut session, &collection, shape)?;
             let mesh = original.mesh(shape, labelling.labels.len())?;
-            with_mesh(args, shape, (&original, &mesh, up), &labelling, &mut own)
+            with_mesh(&form, shape, (&original, &mesh, up), &labelling, &mut own)
                 .map_err(|e| bad_reply(format!("{shape}: {e}")))?
         };
         let stem = file_stem(shape, suffix);
@@ -101,10 +106,35 @@ pub(crate) fn run(args: &Export, mut session: Session) -> Outcome {
     Ok(true)
 }
 
+/// The form of the files to write.
+pub(super) struct Form {
+    pub(super) format: ExportFormat,
+    pub(super) materials: ExportMaterials,
+    pub(super) instances: bool,
+}
+
+/// Suffix and bytes of the file of a shape in any format but OBJ, whose materials are in a file of
+/// their own.
+pub(super) fn encoded(
+    form: &Form,
+    shape: &str,
+    original: &Original,
+    up: Option<[f64; 3]>,
+    labelling: &Labelling<'_>,
+) -> Result<(&'static str, Vec<u8>), CommandError> {
+    if let Some(found) = without_mesh(form.format, shape, labelling) {
+        return Ok(found);
+    }
+    let mesh = original.mesh(shape, labelling.labels.len())?;
+    let mut own = OwnMaterials::beside(labelling.styles);
+    with_mesh(form, shape, (original, &mesh, up), labelling, &mut own)
+        .map_err(|e| CommandError::Failed(format!("{shape}: {e}")))
+}
+
 /// The part of a shape's file name before `suffix`: the shape's name or, if the file name would be
 /// too long for a file system, its beginning with digits that distinguish names with the same
 /// beginning.
-fn file_stem<'a>(shape: &'a str, suffix: &str) -> Cow<'a, str> {
+pub(super) fn file_stem<'a>(shape: &'a str, suffix: &str) -> Cow<'a, str> {
     if shape.len() + suffix.len() <= MAX_FILE_NAME_BYTES {
         return Cow::Borrowed(shape);
     }
@@ -154,7 +184,7 @@ fn up_axis(collection: &wire::Collection) -> Option<[f64; 3]> {
 /// Suffix and bytes of a file that contains the mesh, with its up axis, and its labels. A file in
 /// the format of the original keeps what that holds; `own` collects materials for [`MATERIALS`].
 fn with_mesh(
-    args: &Export,
+    form: &Form,
     shape: &str,
     (original, mesh, up): (&Original, &ParsedMesh, Option<[f64; 3]>),
     labelling: &Labelling<'_>,
@@ -162,11 +192,11 @@ fn with_mesh(
 ) -> Result<(&'static str, Vec<u8>), ParseError> {
     let (vertices, polygons) = (&mesh.vertices, mesh.polygons());
     let bytes = &original.bytes;
-    let materials = match args.materials {
+    let materials = match form.materials {
         ExportMaterials::Own => Materials::Own,
         ExportMaterials::Labels => Materials::Labels,
     };
-    Ok(match (args.format, original.format) {
+    Ok(match (form.format, original.format) {
         (ExportFormat::Obj, Format::Obj) => {
             let bytes = labelled_obj(bytes, labelling, materials, MATERIALS)?;
             (".obj", bytes)
@@ -192,7 +222,7 @@ fn with_mesh(
             (".glb", bytes)
         }
         (ExportFormat::Usda, _) => {
-            let text = usda(shape, vertices, &polygons, labelling, up, args.instances);
+            let text = usda(shape, vertices, &polygons, labelling, up, form.instances);
             (".usda", text.into_bytes())
         }
         _ => {
@@ -224,6 +254,10 @@ pub(super) struct Original {
 }
 
 impl Original {
+    pub(super) fn new(bytes: Vec<u8>, format: Format) -> Self {
+        Self { bytes, format }
+    }
+
     pub(super) fn receive(
         session: &mut Session,
         collection: &str,

@@ -19,6 +19,7 @@ mod export_mesh;
 mod interrupt;
 mod jobs;
 mod keys;
+mod label;
 mod label_file;
 mod labels;
 mod links;
@@ -32,6 +33,7 @@ mod name;
 mod nearest;
 mod npy;
 mod proposals;
+mod publish;
 mod render;
 mod rm;
 mod serve;
@@ -58,7 +60,7 @@ use coseg::ipc::endpoint::EndpointError;
 use coseg::ipc::json;
 use coseg::ipc::keys::KeyError;
 use coseg::ipc::wire::{ErrorReason, LinkKind};
-use coseg::library::LibraryError;
+use coseg::library::{BundleError, LibraryError};
 use session::Session;
 use std::process::ExitCode;
 
@@ -80,6 +82,9 @@ pub(crate) enum CommandError {
     /// A library could not be used without a daemon.
     #[error(transparent)]
     Library(#[from] LibraryError),
+    /// A bundle could not be written or opened.
+    #[error(transparent)]
+    Bundle(#[from] BundleError),
     /// Logging cannot be set up.
     #[error(transparent)]
     Telemetry(#[from] crate::telemetry::TelemetryError),
@@ -122,6 +127,7 @@ impl CommandError {
             Self::Client(_)
             | Self::Serve(_)
             | Self::Library(_)
+            | Self::Bundle(_)
             | Self::Telemetry(_)
             | Self::Keys(_)
             | Self::Synth(_)
@@ -186,12 +192,14 @@ pub(crate) fn run(cli: Cli) -> Result<ExitCode, CommandError> {
         Command::Restore(args) => check::restore(args, &cli.global),
         Command::Describe(args) => describe::run(args, &cli.global),
         Command::Config(args) => config::run(args, &cli.global),
+        Command::Label(args) => label::run(args, &cli.global),
         Command::Add(args) => add::run(args, session()?),
         Command::Wait(args) => wait::run(args, session()?),
         Command::Ls(args) => ls::run(args, session()?),
         Command::Show(args) => show::run(args, session()?),
         Command::Labels(args) => labels::run(args, session()?),
         Command::Export(args) => export::run(args, session()?),
+        Command::Publish(args) => publish::run(args, session()?),
         Command::Render(args) => render::run(args, session()?),
         Command::Map(args) => map::run(args, session()?),
         Command::Transfer(args) => transfer::run(args, session()?),

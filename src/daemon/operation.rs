@@ -167,6 +167,8 @@ operations! {
             GetOriginal(GetOriginalRequest),
             LabelsSnapshot(LabelsSnapshotRequest),
             GetDescriptors(GetDescriptorsRequest),
+            Publish(PublishRequest),
+            GetArrayFile(GetArrayFileRequest),
         }
         /// Changes in order with additions.
         Settle {

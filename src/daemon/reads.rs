@@ -78,6 +78,17 @@ pub(crate) fn fetch(daemon: &Daemon, fetch: Fetch) -> Answer {
                 .map_err(refused)?;
             Reply::GetDescriptors(convert::descriptors(&description.view(), &mut frames))
         }
+        Fetch::Publish(r) => {
+            let head = library.bundle_head(&r.collection).map_err(refused)?;
+            Reply::Publish(convert::bundle_head(head, &mut frames))
+        }
+        Fetch::GetArrayFile(r) => {
+            let blake3 = convert::array_file_digest(&r)?;
+            let file = library.array_file(&r.collection, &r.shape, &blake3);
+            let bytes = file.map_err(refused)?.file_bytes().to_vec();
+            let bytes = Some(frames.file(bytes));
+            Reply::GetArrayFile(wire::GetArrayFileReply { bytes })
+        }
     };
     Ok((result, frames.finish()))
 }

@@ -177,7 +177,8 @@ fn review(r: &wire::Review) -> Value {
     })
 }
 
-fn report(r: &wire::CleanReport) -> Value {
+/// What cleaning found and did.
+pub fn report(r: &wire::CleanReport) -> Value {
     json!({
         "n_polygons": r.n_polygons,
         "n_triangles": r.n_triangles,

@@ -23,7 +23,7 @@ const MAX_NAME: usize = 128;
 const MAX_LABEL_NAME: usize = 128;
 /// Maximum number of part kinds of a collection.
 pub const MAX_PARTS: u32 = 64;
-const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
+pub(super) const WORKING_FACES: std::ops::RangeInclusive<u32> = 200..=100_000;
 
 impl Library {
     /// Creates a collection. A repeated request with the same key returns the same collection.

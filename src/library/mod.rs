@@ -31,6 +31,7 @@
 mod advance;
 mod agreement;
 mod before;
+mod bundle;
 mod change;
 mod choose;
 mod collection;
@@ -51,6 +52,7 @@ mod merge;
 mod names;
 mod once;
 mod pins;
+mod placement;
 mod placing;
 mod points;
 mod proposals;
@@ -77,6 +79,10 @@ mod voting;
 
 pub use advance::MAX_BATCH;
 pub use agreement::Disagreement;
+pub use bundle::{
+    ArrayFile, Bundle, BundleError, BundleFile, BundleHead, BundleInfo, BundledLabel, LabelledMesh,
+    MIN_DISCOVERED_SHAPES, label, write_bundle,
+};
 pub use choose::Chosen;
 pub use collection::discovered::{MAX_MAPS, MAX_REPRESENTATIVES, min_gain, next_recluster};
 pub use collections::MAX_PARTS;

@@ -3,12 +3,13 @@
 use super::advance::{fit_model, relabel_all};
 use super::agreement::n_inconsistent;
 use super::change::{Addition, Change, LabelEdit, commit};
+use super::collection::Collection;
 use super::collection::discovered::{self, NewShape, Plan};
-use super::collection::{Collection, supervised};
 use super::error::{LibraryError, Named, Result};
 use super::facade::Library;
-use super::labelling::{NewLabels, Original, Relabelled, cause, new_labels, new_labels_of};
+use super::labelling::{Relabelled, cause, new_labels_of};
 use super::lookup::object_length;
+use super::placement;
 use super::reason::{Code, Reason};
 use super::refusal::failure;
 use super::rows::{report_to_json, to_json};
@@ -178,7 +179,9 @@ fn place(
     stages.lap("place");
     let plan = plan(store, collection, &new, labelling, lost_training)?;
     stages.lap("recluster");
-    let labels = labels_of_new(store, &new, &plan, accepted, version)?.voted_by(&sources);
+    let labels = placement::labels(store, &new, &plan, &accepted.item.format)?;
+    let mut labels = labels.voted_by(&sources);
+    labels.row.version = version;
     let relabelled = relabelled(store, &plan)?;
     stages.lap("boundary");
     let placed = Placed {
@@ -249,15 +252,9 @@ fn label_new(
     shape: FileView<'_>,
 ) -> Result<(Option<Voted>, u32)> {
     fit_model(store, collection)?;
-    if collection.state().regime.supervision().is_some() {
-        return Ok((supervised::label_new(collection, store, shape)?, 0));
-    }
-    if collection.model().is_none() {
-        return Ok((None, 0));
-    }
-    let nearest = discovered::sources_for(collection, store, shape)?;
+    let nearest = placement::voters(collection, store, shape)?;
     let n_fresh = relabel_all(store, collection, &nearest)?;
-    let voted = discovered::label_new(collection, store, shape, &nearest)?;
+    let voted = placement::label(collection, store, shape, &nearest)?;
     Ok((voted, n_fresh))
 }
 
@@ -269,20 +266,12 @@ fn plan(
     labelling: Option<crate::pipeline::Labelling>,
     lost_training: bool,
 ) -> Result<Plan> {
-    let is_supervised = collection.state().regime.supervision().is_some();
-    let mut plan = match (labelling, collection.model()) {
-        (Some(labelling), Some(model)) if is_supervised => {
-            supervised::plan(collection, store, model, labelling, lost_training)?
-        }
-        (labelling, _) => {
-            if labelling.is_none() || discovered::is_due(collection) {
-                let links = store.links(collection.id())?;
-                let chosen = discovered::representatives(collection, &links);
-                relabel_all(store, collection, &chosen)?;
-            }
-            discovered::plan(collection, store, new, labelling)?
-        }
-    };
+    if placement::clusters(collection) {
+        let links = store.links(collection.id())?;
+        let chosen = discovered::representatives(collection, &links);
+        relabel_all(store, collection, &chosen)?;
+    }
+    let mut plan = placement::plan(collection, store, new, labelling, lost_training)?;
     if plan.state.up_disagrees.is_none() && collection.up().axis().is_some() {
         // No disagreement is known, perhaps because an earlier release began the collection without
         // this check.
@@ -291,24 +280,6 @@ fn plan(
         plan.state.up_disagrees = found.disagrees;
     }
     Ok(plan)
-}
-
-fn labels_of_new(
-    store: &Store,
-    new: &NewShape<'_>,
-    plan: &Plan,
-    accepted: &JobItemRow,
-    version: u64,
-) -> Result<NewLabels> {
-    let model = &plan.model.model;
-    let original = Original {
-        digest: &accepted.item.original_digest,
-        format: &accepted.item.format,
-    };
-    let ids = (&model.labels[..], model.epoch);
-    let mut labels = new_labels(store, new.arrays, &plan.labelling, ids, original)?;
-    labels.row.version = version;
-    Ok(labels)
 }
 
 fn relabelled(store: &Store, plan: &Plan) -> Result<Vec<Relabelled>> {

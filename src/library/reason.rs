@@ -84,6 +84,7 @@ named!(
         NoSpace = "NO_SPACE",
         NoVersion = "NO_VERSION",
         NonFiniteVertex = "NON_FINITE_VERTEX",
+        NotPublishable = "NOT_PUBLISHABLE",
         NothingCorrected = "NOTHING_CORRECTED",
         NothingToAsk = "NOTHING_TO_ASK",
         NothingToSuggest = "NOTHING_TO_SUGGEST",

@@ -18,7 +18,7 @@ use std::ops::Range;
 pub const ARRAY_FORMAT: u32 = 1;
 
 /// The data begins at a multiple of this: a cache line, and the widest vector register.
-pub(super) const DATA_ALIGNMENT: usize = 64;
+pub(crate) const DATA_ALIGNMENT: usize = 64;
 
 /// The reason why a description could not be written, or an array file is invalid.
 #[derive(Debug, thiserror::Error)]
@@ -135,7 +135,7 @@ pub fn write_description(
 
 /// The header of a safetensors file with consecutive arrays: its length, JSON, and spaces up to the
 /// beginning of the data.
-pub(super) fn header<'a>(
+pub(crate) fn header<'a>(
     metadata: Option<serde_json::Map<String, serde_json::Value>>,
     arrays: impl Iterator<Item = (&'a str, Dtype, &'a [usize])>,
 ) -> Vec<u8> {

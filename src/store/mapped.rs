@@ -9,7 +9,7 @@
 
 use super::Digest;
 pub use super::array_file::{ARRAY_FORMAT, ArrayFileError, write_description};
-use super::array_file::{Layout, check_indices};
+use super::array_file::{DATA_ALIGNMENT, Layout, check_indices};
 use super::disk::open_regular;
 use crate::mesh::CleanReport;
 use crate::pipeline::{Description, DescriptionView};
@@ -23,15 +23,51 @@ use std::sync::Arc;
 #[cfg(target_endian = "big")]
 compile_error!("array files are little-endian and used where they are mapped");
 
-/// A description whose arrays are mapped from its file. Clones share the mapping, which stays valid
-/// after the file is removed.
+/// A description whose arrays are mapped from its file, or from one that contains it. Clones share
+/// the mapping, which stays valid after the file is removed.
 #[derive(Debug, Clone)]
 pub struct MappedDescription(Arc<Mapped>);
 
 #[derive(Debug)]
 struct Mapped {
-    file: Mmap,
+    file: MappedFile,
+    /// The bytes of the array file in the mapping.
+    range: Range<usize>,
     layout: Layout,
+}
+
+/// A whole file, mapped for reading. Clones share the mapping.
+#[derive(Debug, Clone)]
+pub struct MappedFile(Arc<Mmap>);
+
+impl MappedFile {
+    /// Maps the file at `path`. Nobody may write into it as long as it is mapped; it may be removed
+    /// or replaced by another file.
+    pub fn open(path: &Path) -> Result<Self, ArrayFileError> {
+        Self::of(&open_regular(path)?)
+    }
+
+    fn of(file: &File) -> Result<Self, ArrayFileError> {
+        if file.metadata()?.len() == 0 {
+            return Err(ArrayFileError::Header("the file is empty".into()));
+        }
+        // SAFETY: the bytes must not change and the file must not shrink while they are borrowed.
+        // Files of the store are written under another name, renamed once complete and never opened
+        // for writing again; the store's lock keeps a second process of ours out, and the store
+        // removes files only by unlinking, which leaves mappings whole. Bundles are written and
+        // replaced in the same way. The mapping is private and read-only, is never handed out
+        // except as slices borrowed from `self`, and every bit pattern is a valid f32, f64 or u32.
+        // Someone else who writes into such files breaks this contract: no program can map files
+        // safely against that.
+        let mapped = unsafe { Mmap::map(file) }?;
+        populate(file, &mapped)?;
+        Ok(Self(Arc::new(mapped)))
+    }
+
+    /// The bytes of the file.
+    pub fn bytes(&self) -> &[u8] {
+        &self.0
+    }
 }
 
 impl MappedDescription {
@@ -52,31 +88,48 @@ impl MappedDescription {
                 expected: expected_len,
             });
         }
-        if found == 0 {
-            return Err(ArrayFileError::Header("the file is empty".into()));
+        let file = MappedFile::of(&file)?;
+        Self::within(&file, 0..file.bytes().len(), expected_blake3)
+    }
+
+    /// Returns the description whose array file is a range of the bytes of a mapped file, which
+    /// must begin at a multiple of 64. Checks it as [`MappedDescription::open`] does.
+    ///
+    /// # Panics
+    /// If the range is not in the file.
+    pub fn within(
+        file: &MappedFile,
+        range: Range<usize>,
+        expected_blake3: Option<[u8; 32]>,
+    ) -> Result<Self, ArrayFileError> {
+        let bytes = &file.bytes()[range.clone()];
+        if !range.start.is_multiple_of(DATA_ALIGNMENT) {
+            return Err(ArrayFileError::Alignment {
+                name: "description",
+                offset: range.start,
+                alignment: DATA_ALIGNMENT,
+            });
         }
-        // SAFETY: the bytes must not change and the file must not shrink while they are borrowed.
-        // Files of the store are written under another name, renamed once complete and never opened
-        // for writing again; the store's lock keeps a second process of ours out, and the store
-        // removes files only by unlinking, which leaves mappings whole. The mapping is private and
-        // read-only, is never handed out except as slices borrowed from `self`, and every bit
-        // pattern is a valid f32, f64 or u32. Someone else who writes into committed files breaks
-        // this contract: no program can map files safely against that.
-        let file_bytes = unsafe { Mmap::map(&file) }?;
-        populate(&file, &file_bytes)?;
         if let Some(expected) = expected_blake3.map(Digest) {
-            let found = Digest::of(&file_bytes);
+            let found = Digest::of(bytes);
             if found != expected {
                 return Err(ArrayFileError::Digest { found, expected });
             }
         }
-        let layout = Layout::parse(&file_bytes)?;
+        let layout = Layout::parse(bytes)?;
+        let file = file.clone();
         let mapped = Self(Arc::new(Mapped {
-            file: file_bytes,
+            file,
+            range,
             layout,
         }));
         check_indices(&mapped.view())?;
         Ok(mapped)
+    }
+
+    /// The bytes of its array file.
+    pub fn file_bytes(&self) -> &[u8] {
+        &self.0.file.bytes()[self.0.range.clone()]
     }
 
     /// The arrays, borrowed from the mapping.
@@ -116,7 +169,7 @@ impl MappedDescription {
 
     /// Size of the file in bytes.
     pub fn file_len(&self) -> usize {
-        self.0.file.len()
+        self.0.range.len()
     }
 
     /// A copy in memory, equal to the description that was written.
@@ -142,7 +195,7 @@ impl MappedDescription {
     }
 
     fn slice<T: bytemuck::AnyBitPattern>(&self, range: &Range<usize>) -> &[T] {
-        bytemuck::try_cast_slice(&self.0.file[range.clone()]).expect(
+        bytemuck::try_cast_slice(&self.file_bytes()[range.clone()]).expect(
             "invariant: the layout was checked for bounds, sizes and alignment, and maps \
                      begin at pages",
         )

@@ -39,13 +39,14 @@ mod reserve;
 pub mod rows;
 pub mod snapshot;
 
+pub(crate) use array_file::{DATA_ALIGNMENT, header as array_file_header};
 pub use array_file::{DescriptionFile, write_description};
 pub use array_stream::ArrayStream;
 pub use catalog::{Catalog, Reader, Tx};
 pub use digest::{Digest, NotADigest};
 pub use error::StoreError;
 pub use health::Health;
-pub use mapped::MappedDescription;
+pub use mapped::{ArrayFileError, MappedDescription, MappedFile};
 pub use objects::{Kept, Objects};
 pub use prepared::PreparedShapes;
 pub use rows::{

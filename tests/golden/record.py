@@ -545,6 +545,7 @@ def asking(r: Recorder) -> None:
         "add_shapes_asked", "two files", [a, b], **add([encoded("a"), encoded("b", 1)], "asked", create=two)
     )
     r.say("error_no_proposals", "two shapes are too few to propose anything", list_proposals=of)
+    r.say("error_not_publishable", "two shapes without a person's labels are too few", publish=of)
     r.say("next_question", "the part whose label is worth most", next_question=of)
     part = {**of, "shape": "a", "part": 0, "by": "ada"}
     r.say("answer_question", "a name, which makes a label", answer_question={**part, "named": "head"})
@@ -566,6 +567,12 @@ def asking(r: Recorder) -> None:
         "error_labelled_by_person",
         "labels follow from what a person labelled",
         choose_proposal={**of, "n": 1},
+    )
+    r.say("publish", "the beginning of a bundle, and the array files behind it", publish=of)
+    r.say(
+        "error_gone",
+        "an array file that the shape does not have",
+        get_array_file={**of, "shape": "a", "blake3": "0" * 64},
     )
     r.say("error_nothing_to_ask", "a person labelled every part", next_question={**of, "passed": True})
 

@@ -12,6 +12,7 @@ mod linking;
 mod overload;
 mod paths;
 mod proposing;
+mod publishing;
 mod refusing;
 mod repeats;
 mod resident;

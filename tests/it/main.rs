@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod asking;
+mod bundles;
 mod cli;
 mod correcting;
 mod daemon;

@@ -84,6 +84,8 @@ CALLS: dict[str, Call] = {
     "link_parts": lambda _, c: c.same(("a", 0), ("b", 1)),
     "unlink_parts": lambda _, c: c.unlink(1),
     "list_links": lambda _, c: c.links("a"),
+    "publish": lambda _, c: c.bundle_head(),
+    "get_array_file": lambda _, c: c.array_file("a", "0" * 64),
 }
 
 

@@ -1,6 +1,7 @@
 /** One collection: shapes, labels, analysis, corrections, events. */
 
 import { randomUUID } from "node:crypto";
+import { open, rename, rm } from "node:fs/promises";
 import { setTimeout as sleep } from "node:timers/promises";
 import { fromBinary } from "@bufbuild/protobuf";
 import { batches, type Batch, type Item } from "./batch.js";
@@ -29,6 +30,7 @@ import type {
   Added,
   Answer,
   Answered,
+  BundleHead,
   ChangedLabel,
   Chosen,
   CollectionInfo,
@@ -48,6 +50,7 @@ import type {
   PartOfShape,
   Points,
   Proposals,
+  Published,
   Rows,
   Question,
   Settings,
@@ -65,6 +68,8 @@ import { FrameWriter, formatName, plain, type Encoded, type Matrix, type Mesh } 
 /** Silence after which the client subscribes again; heartbeats come once a second. */
 const SILENCE_MS = 3_000;
 const HEARTBEAT_TOPIC = "\0";
+/** Array files of a bundle begin at multiples of so many bytes. */
+const BUNDLE_ALIGNMENT = 64;
 
 const VERDICTS: Record<Verdict, ReviewState> = {
   unseen: ReviewState.UNSEEN,
@@ -264,6 +269,51 @@ export class Collection {
   async original(name: string): Promise<Encoded> {
     const [reply, raw] = await this.library.call("getOriginal", { collection: this.name, shape: name });
     return { format: formatName(reply.format), data: raw.file(reply.bytes) };
+  }
+
+  /**
+   * Writes everything that labels a new shape now to the file `path`, for `coseg label`. The file is replaced when it is
+   * whole. Throws `FailedPrecondition` (NOT_PUBLISHABLE) if the collection has too few labelled shapes, or shapes wait to
+   * be relabelled: `waitIdle` waits for them.
+   */
+  async publish(path: string): Promise<Published> {
+    const { head, files, ...published } = await this.bundleHead();
+    const part = `${path}.${process.pid}.part`;
+    const file = await open(part, "w");
+    try {
+      try {
+        await file.writeFile(head);
+        for (const { shape, blake3, length } of files) {
+          const found = await this.arrayFile(shape, blake3);
+          if (found.length !== length) {
+            throw new BadReply(`array file of "${shape}": ${found.length} bytes, not ${length}`);
+          }
+          await file.writeFile(found);
+          await file.writeFile(new Uint8Array((BUNDLE_ALIGNMENT - (length % BUNDLE_ALIGNMENT)) % BUNDLE_ALIGNMENT));
+        }
+        await file.sync();
+      } finally {
+        await file.close();
+      }
+      await rename(part, path);
+    } catch (error) {
+      await rm(part, { force: true });
+      throw error;
+    }
+    return published;
+  }
+
+  /** The beginning of the file that `publish` writes, and the array files that follow it. */
+  async bundleHead(): Promise<BundleHead> {
+    const [reply, raw] = await this.library.call("publish", { collection: this.name });
+    const { head: _, ...rest } = plain(reply);
+    return { ...rest, head: raw.file(reply.head) };
+  }
+
+  /** The array file of a shape, which must have this BLAKE3. */
+  async arrayFile(name: string, blake3: string): Promise<Uint8Array> {
+    const [reply, raw] = await this.library.call("getArrayFile", { collection: this.name, shape: name, blake3 });
+    return raw.file(reply.bytes);
   }
 
   /** Removes a shape. */

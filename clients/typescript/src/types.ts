@@ -6,6 +6,7 @@ import type {
   MapQuality as WireMapQuality,
   Neighbor as WireNeighbor,
 } from "./gen/coseg/v1/analysis_pb.js";
+import type { BundleFile as WireBundleFile, PublishReply } from "./gen/coseg/v1/bundle_pb.js";
 import type { Collection as WireCollection, LabelInfo, UpdateCollectionReply } from "./gen/coseg/v1/collection_pb.js";
 import type { CorrectLabelsReply, SuggestNextReply, UndoReply } from "./gen/coseg/v1/correction_pb.js";
 import type { ChooseProposalReply, ListProposalsReply } from "./gen/coseg/v1/proposal_pb.js";
@@ -57,6 +58,12 @@ export type Updated = Plain<UpdateCollectionReply>;
 export type Proposals = Plain<ListProposalsReply>;
 /** The result of choosing a proposal. */
 export type Chosen = Plain<ChooseProposalReply>;
+/** An array file that a bundle contains. */
+export type BundleFile = Plain<WireBundleFile>;
+/** The beginning of a bundle, and the array files that follow it. */
+export type BundleHead = Omit<Plain<PublishReply>, "head"> & { readonly head: Uint8Array };
+/** A bundle that was written. */
+export type Published = Omit<BundleHead, "head" | "files">;
 /** The shape that is most worth labelling by hand. */
 export type Suggestion = Plain<SuggestNextReply>;
 /** A person's verdict on the labels of a shape. */

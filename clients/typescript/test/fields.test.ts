@@ -86,6 +86,8 @@ const CALLS: Record<string, (lib: coseg.Library, c: coseg.Collection) => unknown
   linkParts: (_, c) => c.same({ shape: "a", part: 0 }, { shape: "b", part: 1 }),
   unlinkParts: (_, c) => c.unlink(1),
   listLinks: (_, c) => c.links("a"),
+  publish: (_, c) => c.bundleHead(),
+  getArrayFile: (_, c) => c.arrayFile("a", "0".repeat(64)),
 };
 
 /** The result, or what is wrong with a reply that has other rows than requested. */

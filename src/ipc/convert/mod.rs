@@ -1,6 +1,7 @@
 //! Converts wire messages to domain values and back; no other module knows both.
 
 mod analysis;
+mod bundles;
 mod checked;
 mod collections;
 mod corrections;
@@ -16,6 +17,7 @@ pub use analysis::{
     agreement, descriptors, from_rows, functional_map, hks, hks_at, nearest, part_correspondence,
     point_maps, point_request, polygon_values, resolution, spectrum, spectrum_at, transferred,
 };
+pub use bundles::{array_file_digest, bundle_head, bundle_head_from_wire};
 pub use checked::{
     MAX_LANDMARKS, MAX_PORTRAITS, NamedFrames, check_addition, check_correction, check_creation,
     check_hks, check_link, check_map, check_portraits, check_review, check_reviews, check_spectrum,

@@ -122,6 +122,20 @@ impl Collection {
         })
     }
 
+    /// Makes a collection of values that were published.
+    pub(super) fn published(
+        row: CollectionRow,
+        model: ModelState,
+        shapes: Vec<KnownShape>,
+    ) -> Result<Self> {
+        Ok(Self {
+            state: State::of(&row)?,
+            row,
+            model: Some(model),
+            shapes,
+        })
+    }
+
     pub(super) fn id(&self) -> CollectionId {
         self.row.id
     }

@@ -7,6 +7,10 @@ With meshes of your own, in this process (:mod:`coseg.geometry`):
 >>> cat.spectrum(k=300).eigenvalues                                        # doctest: +SKIP
 >>> coseg.functional_map(cat, lion).p2p_21                                 # doctest: +SKIP
 
+By a bundle that ``coseg publish`` wrote, without a daemon (:func:`label`):
+
+>>> coseg.label("cat.off", "animals.coseg").labels                         # doctest: +SKIP
+
 With a daemon that keeps a library of shapes labelled:
 
 >>> lib = coseg.Library()                                   # doctest: +SKIP
@@ -23,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from coseg._async_client import AsyncCollection, AsyncLibrary
 from coseg._batch import Item
+from coseg._bundle import label, label_all
 from coseg._client import Collection, Library
 from coseg._options import Curve, default_endpoint
 from coseg._wire import MeshLike
@@ -52,6 +57,8 @@ from coseg.errors import (
 )
 from coseg.types import (
     Added,
+    BundleFile,
+    BundleHead,
     Carrying,
     ChangedLabel,
     Chosen,
@@ -66,6 +73,7 @@ from coseg.types import (
     Job,
     JobItem,
     Label,
+    LabelledMesh,
     Labelling,
     Limits,
     Link,
@@ -78,6 +86,7 @@ from coseg.types import (
     PartMatches,
     Proposal,
     Proposals,
+    Published,
     RetriedJob,
     Shape,
     Snapshot,
@@ -102,6 +111,8 @@ __all__ = [
     "AsyncLibrary",
     "BadMesh",
     "BadReply",
+    "BundleFile",
+    "BundleHead",
     "Cancelled",
     "Carrying",
     "ChangedLabel",
@@ -129,6 +140,7 @@ __all__ = [
     "Job",
     "JobItem",
     "Label",
+    "LabelledMesh",
     "Labelling",
     "LaplacianError",
     "Library",
@@ -149,6 +161,7 @@ __all__ = [
     "PermissionDenied",
     "Proposal",
     "Proposals",
+    "Published",
     "Refused",
     "ResourceExhausted",
     "RetriedJob",
@@ -166,6 +179,8 @@ __all__ = [
     "Updated",
     "default_endpoint",
     "functional_map",
+    "label",
+    "label_all",
     "read_mesh",
 ]
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import uuid
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,8 @@ SILENCE_S = 3.0
 #: Seconds between tries while a daemon drains and another has not taken its place.
 DRAINING_RETRY_S = 0.5
 HEARTBEAT_TOPIC = b"\0"
+#: Array files of a bundle begin at multiples of so many bytes.
+BUNDLE_ALIGNMENT = 64
 
 
 class AsyncLibrary:
@@ -427,6 +431,44 @@ class AsyncCollection:
         """The bytes of a shape as they were sent; of arrays, an OFF file with the same values."""
         reply, raw = await self._call("get_original", shape=name)
         return t.Encoded(wire.format_name(reply.format), raw.file(reply.bytes))
+
+    async def publish(self, path: str | os.PathLike[str]) -> t.Published:
+        """Writes everything that labels a new shape now to the file ``path``, for :func:`coseg.label`.
+
+        The file is replaced when it is whole. Raises :class:`coseg.FailedPrecondition` (NOT_PUBLISHABLE)
+        if the collection has too few labelled shapes, or shapes wait to be relabelled: :meth:`wait_idle`
+        waits for them.
+        """
+        head = await self.bundle_head()
+        target = Path(path)
+        part = target.with_name(f"{target.name}.{os.getpid()}.part")
+        try:
+            with part.open("wb") as file:
+                file.write(head.head)
+                for wanted in head.files:
+                    found = await self.array_file(wanted.shape, wanted.blake3)
+                    if len(found) != wanted.length:
+                        text = f"array file of {wanted.shape!r}: {len(found)} bytes, not {wanted.length}"
+                        raise BadReply(text)
+                    file.write(found)
+                    file.write(bytes(-len(found) % BUNDLE_ALIGNMENT))
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+        return t.Published(head.bundle, head.sequence, head.epoch, head.n_bytes, head.clusters_next)
+
+    async def bundle_head(self) -> t.BundleHead:
+        """The beginning of the file that :meth:`publish` writes, and the array files that follow it."""
+        reply, raw = await self._call("publish")
+        files = tuple(wire.flat(t.BundleFile, file) for file in reply.files)
+        return wire.flat(t.BundleHead, reply, head=raw.file(reply.head), files=files)
+
+    async def array_file(self, name: str, blake3: str) -> bytes:
+        """The array file of a shape, which must have this BLAKE3; docs/format.md describes it."""
+        reply, raw = await self._call("get_array_file", shape=name, blake3=blake3)
+        return raw.file(reply.bytes)
 
     async def remove(self, name: str) -> None:
         """Removes a shape."""

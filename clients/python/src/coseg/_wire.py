@@ -128,6 +128,11 @@ def mesh_format(name: str) -> Any:
     return job_pb2.MeshFormat.Value(key)
 
 
+def dtype_of(value: Any) -> np.dtype[Any]:
+    """The type of the elements of an array."""
+    return _DTYPES[value]
+
+
 def format_name(value: int) -> str:
     """The name of a format, such as ``off``."""
     return enum_name(job_pb2.MeshFormat, "MESH_FORMAT_", value)

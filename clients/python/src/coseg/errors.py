@@ -116,11 +116,16 @@ class Refused(CosegError):
         self.code, self.reason, self.message = code, reason, message
 
     @staticmethod
+    def of(code: str, reason: str, message: str) -> Refused:
+        """The exception for a code."""
+        return Refused._classes.get(code, Refused)(code, reason, message)
+
+    @staticmethod
     def from_wire(error: error_pb2.Error) -> Refused:
         """The exception for an error of the protocol."""
         code = _name(error_pb2.ErrorCode, "ERROR_CODE_", error.code)
         reason = _name(error_pb2.ErrorReason, "ERROR_REASON_", error.reason)
-        refused = Refused._classes.get(code, Refused)(code, reason, error.message)
+        refused = Refused.of(code, reason, error.message)
         subject = error.WhichOneof("subject")
         if subject is not None:
             setattr(refused, subject, getattr(error, subject))

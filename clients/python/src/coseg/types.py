@@ -169,6 +169,84 @@ class Source:
 
 
 @dataclass(frozen=True)
+class LabelledMesh:
+    """The labels of a mesh by a bundle: those that the daemon would have given to it then."""
+
+    #: (n,) label of each face of the mesh, in its order.
+    labels: Int32
+    #: (n,) probability of the label of each face, 0 to 1.
+    confidence: Float32
+    #: Connected pieces of one label, largest first.
+    parts: tuple[Part, ...]
+    #: Labels in use in the collection that no face has, in ascending order.
+    missing: tuple[int, ...]
+    #: The shapes that voted for the labels.
+    sources: tuple[Source, ...]
+    #: What cleaning found and did, by name.
+    report: dict[str, int]
+    #: Surface area in squared input units.
+    area: float
+    #: BLAKE3 of the file, hexadecimal.
+    content_digest: str
+    #: Number of functional maps that were computed.
+    n_maps: int
+    #: If the mesh clustered the collection again: whether the labels that were found are new ones.
+    reclustered: bool | None
+    #: Names the content of the bundle.
+    bundle: str
+    #: Whether the bundle was published on this kind of processor.
+    same_processor: bool
+
+
+@dataclass(frozen=True)
+class BundleFile:
+    """An array file that a bundle contains."""
+
+    #: The shape that it describes.
+    shape: str
+    #: BLAKE3 of the file, hexadecimal.
+    blake3: str
+    #: Its bytes.
+    length: int
+
+
+@dataclass(frozen=True)
+class BundleHead:
+    """The beginning of a bundle, and the array files that follow it."""
+
+    #: The bytes.
+    head: bytes
+    #: The array files in their order, each followed by zeros up to a multiple of 64 bytes.
+    files: tuple[BundleFile, ...]
+    #: Names the content of the bundle.
+    bundle: str
+    #: Sequence number of the collection.
+    sequence: int
+    #: Epoch of its labels.
+    epoch: int
+    #: Bytes of the whole bundle.
+    n_bytes: int
+    #: Whether the next shape clusters the collection again, perhaps with other labels than now.
+    clusters_next: bool
+
+
+@dataclass(frozen=True)
+class Published:
+    """A bundle that was written."""
+
+    #: Names the content of the bundle.
+    bundle: str
+    #: Sequence number of the collection.
+    sequence: int
+    #: Epoch of its labels.
+    epoch: int
+    #: Bytes of the file.
+    n_bytes: int
+    #: Whether the next shape clusters the collection again, perhaps with other labels than now.
+    clusters_next: bool
+
+
+@dataclass(frozen=True)
 class Review:
     """A person's verdict on the labels of a shape: ``"unseen"``, ``"corrected"``, ``"approved"`` or
     ``"doubtful"``."""
