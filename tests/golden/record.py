@@ -568,6 +568,8 @@ def asking(r: Recorder) -> None:
         "labels follow from what a person labelled",
         choose_proposal={**of, "n": 1},
     )
+    idle = {"collection": "asked", "wait_ms": 20_000}
+    r.say("wait_idle_before_publish", "labels have followed the approvals", wait_idle=idle)
     r.say("publish", "the beginning of a bundle, and the array files behind it", publish=of)
     r.say(
         "error_gone",
