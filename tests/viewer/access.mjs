@@ -259,7 +259,8 @@ export async function accessTests({ test, open, coseg, shot, url, file, names })
   await test("what is queued elsewhere is not counted here", async () => {
     const page = await open(`${url}#chairs`);
     const queue = { chairs: 0, candelabras: 7 };
-    await page.route("**/api/library?", async (route) => {
+    const isLibrary = (address) => address.pathname === "/api/library";
+    await page.route(isLibrary, async (route) => {
       const response = await route.fetch();
       const library = await response.json();
       for (const c of library.collections) {
@@ -268,8 +269,8 @@ export async function accessTests({ test, open, coseg, shot, url, file, names })
       }
       await route.fulfill({ json: { ...library, n_queued: 7 + queue.chairs } });
     });
-    await page.waitForResponse("**/api/library?");
-    await page.waitForResponse("**/api/library?");
+    for (let n = 0; n < 2; n++)
+      await page.waitForResponse((response) => isLibrary(new URL(response.url())));
     assert.equal(await page.textContent("#state"), "live");
     queue.chairs = 3;
     await page.waitForFunction(() => document.querySelector("#state").textContent === "3 to place");
