@@ -43,10 +43,12 @@ def test_labels_are_those_of_the_daemon(
     published = corrected.publish(bundle)
     assert published.n_bytes == bundle.stat().st_size and not published.clusters_next
     vertices, faces = arrays(meshes[6])
-    by_bundle = coseg.label_all(
-        {"file": meshes[5], "arrays": (vertices, faces), "bad": coseg.Encoded("off", b"OFF\n1 1 0\n0 0 0\n")},
-        bundle,
-    )
+    sent: dict[str, coseg.MeshLike] = {
+        "file": meshes[5],
+        "arrays": (vertices, faces),
+        "bad": coseg.Encoded("off", b"OFF\n1 1 0\n0 0 0\n"),
+    }
+    by_bundle = coseg.label_all(sent, bundle)
     assert list(by_bundle) == ["file", "arrays", "bad"]
     bad = by_bundle["bad"]
     assert isinstance(bad, coseg.InvalidArgument) and bad.reason == "PARSE"
