@@ -172,9 +172,26 @@ pub(super) fn pin_polygons(row: &mut LabelVersionRow, pins: &[i32]) {
 
 #[cfg(test)]
 mod tests {
-    use super::spread;
+    use super::{UsedLabels, Vocabulary, spread};
     use crate::mesh::icosphere;
     use crate::segmentation::Surface;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn a_sample_as_large_as_a_shape_covers_an_open_vocabulary() {
+        let sampled = |vocabulary, area| {
+            let used = UsedLabels {
+                labels: BTreeSet::new(),
+                vocabulary,
+                shown: Vocabulary::Open,
+                area,
+            };
+            used.sampled()
+        };
+        assert_eq!(sampled(Vocabulary::Open, 0.5), Vocabulary::Open);
+        assert_eq!(sampled(Vocabulary::Open, 1.5), Vocabulary::Covered);
+        assert_eq!(sampled(Vocabulary::Closed, 1.5), Vocabulary::Closed);
+    }
 
     #[test]
     fn faces_without_a_class_take_that_of_the_nearest_face() {
